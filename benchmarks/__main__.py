@@ -1,0 +1,52 @@
+"""Runs the suites and prints, writes or holds against the committed table what they measured."""
+
+import argparse
+import datetime
+import importlib.metadata
+import os
+import platform
+import sys
+
+from . import metrics as contract
+
+
+def machine() -> str:
+    """One line about where the figures come from."""
+    names = ("jax", "optimistix", "poselib", "numpy")
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
+    return f"{datetime.date.today()}, {os.cpu_count()} cores ({platform.machine()}), float64, {versions}."
+
+
+def main() -> int:
+    from .engine import QUICK, SUITES, Size
+
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few pairs, few repeats: does it run, roughly how fast")
+    parser.add_argument("--only", choices=SUITES, action="append", help="this suite alone (may be repeated)")
+    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results.md")
+    parser.add_argument(
+        "--gate", action="store_true", help="fail where a figure is worse than the committed one allows"
+    )
+    options = parser.parse_args()
+    if options.write and (options.only or options.quick):
+        parser.error("--write takes a whole run: the table's figures stand beside each other")
+
+    measured = []
+    for name in options.only or SUITES:
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        measured += SUITES[name](QUICK if options.quick else Size())
+    print(f"{machine()}\n\n{contract.table(measured)}")
+
+    worse = []
+    if options.gate:
+        before = contract.committed()
+        worse = [m for m in measured if m.key in before and not m.held_against(before[m.key])]
+        for metric in worse:
+            print(f"worse: {metric.key}: {metric.value:.4g} {metric.unit}, committed {before[metric.key]:.4g}")
+    if options.write:
+        contract.write(measured, machine())
+    return 1 if worse else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,38 @@
+"""jaxro: differentiable least-squares adjustment and relative orientation of stereo pairs, on JAX.
+
+Importing it switches JAX to 64 bit, unless JAX_ENABLE_X64 is set in the environment.
+"""
+
+import os as _os
+
+import jax as _jax
+
+if "JAX_ENABLE_X64" not in _os.environ:
+    _jax.config.update("jax_enable_x64", True)
+
+from . import coplanarity as coplanarity, losses as losses, rotations as rotations, starts as starts
+from .adjustment import Adjustment as Adjustment, adjust as adjust
+from .elements import (
+    AbstractElements as AbstractElements,
+    DependentElements as DependentElements,
+    IndependentElements as IndependentElements,
+    RelativePose as RelativePose,
+    convert as convert,
+    essential_matrix as essential_matrix,
+    to_pose as to_pose,
+    vertical as vertical,
+)
+from .normal_equations import GaussNewton as GaussNewton
+from .orientation import Orientation as Orientation, orient as orient
+from .pairs import (
+    Camera as Camera,
+    Pair as Pair,
+    pad as pad,
+    pair as pair,
+    stack as stack,
+    swapped as swapped,
+    unstack as unstack,
+)
+from .results import RESULTS as RESULTS, is_usable as is_usable
+
+__version__ = "0.1.0"

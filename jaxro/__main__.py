@@ -1,0 +1,5 @@
+"""`python -m jaxro`"""
+
+from .cli import app
+
+app(prog_name="jaxro")

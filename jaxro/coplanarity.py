@@ -1,0 +1,127 @@
+"""The coplanarity condition, the strict y-parallax and the intersection of one point.
+
+    g = b . (p1 x R p2) = 0,    p = (x, y, -f)
+
+Two ways to adjust it, each a function of the pair that says what is adjusted: condition, observations, cofactors.
+
+* `rigorous`: all four coordinates are measured with errors; the whitened residual is g / sqrt(B Q Bᵀ), B = dg/dl.
+  Statistically right, the default.
+* `parallax`: the y-parallax q of the photos turned parallel to the base is taken as measured with unit weight, as in
+  the papers (Dorozhinsky 1971, Table 2).
+
+Both residuals are in the unit of the coordinates when sigma is 1.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from . import rotations as rot
+from .elements import AbstractElements, essential_matrix
+from .pairs import Pair
+from .rotations import Matrix, Vector
+
+Scalar = Float[Array, "..."]
+Point = tuple[Scalar, Scalar, Scalar, Scalar]
+"""x_left, y_left, x_right, y_right of one point"""
+
+
+class Adjusted(NamedTuple):
+    """What `adjust` needs: condition(elements, observation) for one point, observations and cofactors of all points."""
+
+    condition: Callable
+    observations: tuple
+    cofactor: tuple
+
+
+def fundamental_matrix(elements: AbstractElements, focal_left: Scalar, focal_right: Scalar) -> Matrix:
+    """F = diag(1, 1, -f1) E diag(1, 1, -f2), so that g = (x1, y1, 1) F (x2, y2, 1)ᵀ; once for a pair."""
+    e = essential_matrix(elements)
+    return (
+        (e[0][0], e[0][1], -focal_right * e[0][2]),
+        (e[1][0], e[1][1], -focal_right * e[1][2]),
+        (-focal_left * e[2][0], -focal_left * e[2][1], focal_left * focal_right * e[2][2]),
+    )
+
+
+def condition(f: Matrix, point: Point) -> Scalar:
+    """g of one point, from the fundamental matrix of the pair."""
+    x1, y1, x2, y2 = point
+    a, b, c = (row[0] * x2 + row[1] * y2 + row[2] for row in f)
+    return x1 * a + y1 * b + c
+
+
+def turned(elements: AbstractElements) -> tuple[Matrix, Matrix]:
+    """Rotations of the left and right photo into the frame parallel to the base.
+
+    X runs along the base and the left photo is not turned about X: Y = z x X / |z x X| with z the axis of the left
+    photo. These are the papers' R_alpha R_chi and R_alpha' R_omega' R_chi', without their angles; undefined only for a
+    base along the photo axis.
+    """
+    rotation, base = elements.relative()
+    across = jnp.hypot(base[0], base[1])
+    x = rot.unit(base)
+    y = (-base[1] / across, base[0] / across, jnp.zeros_like(across))
+    left = (x, y, rot.cross(x, y))
+    return left, rot.product(left, rotation)
+
+
+def y_parallax(frames: tuple[Matrix, Matrix], point: Point, focal_left: Scalar, focal_right: Scalar) -> Scalar:
+    """q = y1* - y2* = -f1 (Y1/Z1 - Y2/Z2) of one point, the photos turned parallel to the base by `turned`."""
+    x1, y1, x2, y2 = point
+    left, right = frames
+    first = rot.apply(left, (x1, y1, -focal_left))
+    second = rot.apply(right, (x2, y2, -focal_right))
+    return -focal_left * (first[1] / first[2] - second[1] / second[2])
+
+
+def rigorous(pair: Pair) -> Adjusted:
+    """Adjust the four image coordinates of every point."""
+
+    def of_point(elements: AbstractElements, point: Point) -> Scalar:
+        return condition(fundamental_matrix(elements, pair.focal_left, pair.focal_right), point)
+
+    return Adjusted(of_point, pair.coordinates, (pair.sigma**2,) * 4)
+
+
+def parallax(pair: Pair) -> Adjusted:
+    """Adjust the y-parallax of every point as if it had been measured; the coordinates are taken as free of error."""
+
+    def of_point(elements: AbstractElements, observation: tuple[Point, Scalar]) -> Scalar:
+        point, measured = observation
+        return y_parallax(turned(elements), point, pair.focal_left, pair.focal_right) - measured
+
+    return Adjusted(of_point, (pair.coordinates, jnp.zeros_like(pair.sigma)), ((None,) * 4, pair.sigma**2))
+
+
+def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:
+    """v = -Q Bᵀ (B Q Bᵀ)⁻¹ g: what brings the rays of one point to intersection with the shortest v.
+
+    sigma is equal for the four coordinates of a point, so it cancels.
+    """
+    g, gradient = jax.value_and_grad(condition, argnums=1)(f, point)
+    squared = sum(entry**2 for entry in gradient)
+    factor = jnp.where(use, -g / jnp.where(use, squared, 1.0), 0.0)
+    return tuple(factor * entry for entry in gradient)  # pyright: ignore[reportReturnType]
+
+
+def intersection(
+    rotation: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar
+) -> tuple[Vector, Scalar, Scalar]:
+    """Model point halfway between the rays p1 and b + R p2 at their closest, and the depth factors λ, μ.
+
+    With w = p1 x R p2: λ = ((b x R p2) . w) / w², μ = ((b x p1) . w) / w². Parallel rays give λ = μ = inf with the
+    sign of the side they would meet on.
+    """
+    x1, y1, x2, y2 = point
+    first = (x1, y1, -focal_left)
+    second = rot.apply(rotation, (x2, y2, -focal_right))
+    w = rot.cross(first, second)
+    squared = rot.dot(w, w)
+    lam = rot.dot(rot.cross(base, second), w) / squared
+    mu = rot.dot(rot.cross(base, first), w) / squared
+    half = tuple((lam * p + b + mu * s) / 2 for p, b, s in zip(first, base, second, strict=True))
+    return half, lam, mu  # pyright: ignore[reportReturnType]

@@ -1,0 +1,139 @@
+"""The files of --out: elements.csv, residuals.csv, points.csv, summary.json, in full precision, all or none.
+
+A number is written as its shortest text that reads back as the same float. What does not exist is an empty cell, null
+in JSON. Headers carry the units; angles are degrees.
+"""
+
+import csv
+import io
+import json
+import math
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+from .solutions import Solution, Units
+from .tables import TableError
+
+
+def check_target(directory: Path, force: bool) -> None:
+    """Raises TableError unless a result may be written there."""
+    if directory.exists() and not directory.is_dir():
+        raise TableError(directory, None, None, "a file", "the name of a folder for the results")
+    if not force and directory.exists() and any(directory.iterdir()):
+        raise TableError(directory, None, None, "a folder that is not empty", "a new folder, or --force to overwrite")
+
+
+def write(directory: Path, solved: list[Solution], units: Units, summary: dict[str, Any]) -> None:
+    """All four files, first complete in a folder beside `directory`, then renamed into place.
+
+    Raises TableError, with nothing written, where the disk refuses.
+    """
+    texts = {
+        "elements.csv": _csv(_element_rows(solved, units)),
+        "residuals.csv": _csv(_point_rows(solved, RESIDUALS, units)),
+        "points.csv": _csv(_point_rows(solved, POINTS, units)),
+        "summary.json": _json(solved, units, summary),
+    }
+    draft = directory.absolute().with_name(f".{directory.absolute().name}.{os.getpid()}.partial")
+    try:
+        draft.mkdir(parents=True)
+        for name, text in texts.items():
+            (draft / name).write_text(text, encoding="utf-8", newline="")
+        directory.mkdir(exist_ok=True)
+        for name in texts:
+            os.replace(draft / name, directory / name)
+    except OSError as error:
+        raise TableError(directory, None, None, error.strerror or str(error), "a folder that can be written") from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+RESIDUALS = ("q", "v_x_left", "v_y_left", "v_x_right", "v_y_right", "redundancy", "in_front")
+POINTS = ("X", "Y", "Z")
+
+
+def _element_rows(solved: list[Solution], units: Units) -> list[list[Any]]:
+    header = ["pair", "result", "points", "degrees_of_freedom", "iterations"]
+    for e in solved[0].elements:
+        header += [_head(e.name, e.unit)] + ([] if e.deviation is None else [_head(f"sd_{e.name}", e.unit)])
+    rows = [[*header, _head("m_q", units.photo), _head("sigma0", units.sigma0), "advice"]]
+    for s in solved:
+        row = [s.measured.name, s.result, len(s.measured.points), *_counts(s).values()]
+        for e in s.elements:
+            row += [e.value] + ([] if e.deviation is None else [e.deviation])
+        rows.append([*row, s.m_q, s.sigma0, s.advice])
+    return rows
+
+
+def _point_rows(solved: list[Solution], keys: tuple[str, ...], units: Units) -> list[list[Any]]:
+    unit = {"redundancy": "", "in_front": "", **dict.fromkeys(POINTS, units.model)}
+    rows = [["pair", "point", *(_head(key, unit.get(key, units.photo)) for key in keys)]]
+    for s in solved:
+        rows += [[s.measured.name, values["point"], *(values[key] for key in keys)] for values in s.points]
+    return rows
+
+
+def _head(name: str, unit: str) -> str:
+    return f"{name}_{unit}" if unit else name
+
+
+def _counts(s: Solution) -> dict[str, int]:
+    o = s.orientation
+    return {"degrees_of_freedom": int(o.degrees_of_freedom), "iterations": int(o.iterations)}
+
+
+def _exists(value: Any) -> bool:
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
+
+
+def _csv(rows: list[list[Any]]) -> str:
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(
+        [str(value).lower() if isinstance(value, bool) else value if _exists(value) else "" for value in row]
+        for row in rows
+    )
+    return text.getvalue()
+
+
+def _json(solved: list[Solution], units: Units, summary: dict[str, Any]) -> str:
+    pairs = [
+        {
+            "pair": s.measured.name,
+            "result": s.result,
+            "usable": s.usable,
+            "advice": s.advice,
+            "points": len(s.measured.points),
+            **_counts(s),
+            "m_q": s.m_q,
+            "sigma0": s.sigma0,
+            "elements": {e.name: {"unit": e.unit or None, "value": e.value, "sd": e.deviation} for e in s.elements},
+            "correlations": s.correlations,
+            "cameras": [
+                {
+                    "focal": c.focal,
+                    "principal_point": list(c.principal_point),
+                    "pixel_size": c.pixel_size,
+                    "y_down": c.y_down,
+                }
+                for c in s.cameras
+            ],
+        }
+        for s in solved
+    ]
+    whole = {
+        **summary,
+        "units": {"photo": units.photo, "model": units.model, "sigma0": units.sigma0 or None, "angles": "deg"},
+        "pairs": pairs,
+    }
+    return json.dumps(_clean(whole), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _clean(value: Any) -> Any:
+    """The value with null for every number that does not exist."""
+    if isinstance(value, dict):
+        return {key: _clean(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_clean(entry) for entry in value]
+    return value if _exists(value) else None

@@ -1,0 +1,170 @@
+"""Oriented pairs as reports need them: NumPy values without padding, degrees, names and units.
+
+The terminal report and the files of --out read the same `Solution`s. Where a result is not usable its elements, m_q and
+sigma0 are NaN here; the y-parallaxes, corrections and `in_front` stay where they say which points are at fault.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import rotations as rot
+from ..elements import DependentElements, RelativePose
+from ..orientation import Orientation
+from ..pairs import Camera
+from ..results import RESULTS
+from .tables import Measurements
+
+NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+"""Names of the results by their number."""
+
+ADVICE = {name: RESULTS[item] for name, item in RESULTS._name_to_item.items()}
+"""The sentence of each result, empty for a plain success."""
+
+WARNED = ("no_redundancy", "two_solutions")
+"""Usable results with something to mind."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units of the photo coordinates, of base and model, and of sigma0 ("" where it is a ratio to given sigmas)."""
+
+    photo: str
+    model: str
+    sigma0: str
+
+
+@dataclass(frozen=True)
+class Element:
+    """One reported number of an orientation; `deviation` is None for what is given, not adjusted."""
+
+    name: str
+    unit: str
+    value: float
+    deviation: float | None
+
+
+@dataclass(frozen=True)
+class Solution:
+    """One pair, its cameras, its finished orientation and the elements that are shown."""
+
+    measured: Measurements
+    cameras: tuple[Camera, Camera]
+    orientation: Orientation
+    elements: list[Element]
+
+    @cached_property
+    def result(self) -> str:
+        """The name of the result."""
+        return NAMES[int(self.orientation.result._value)]
+
+    @cached_property
+    def advice(self) -> str:
+        """The sentence of the result, empty for a plain success."""
+        return ADVICE[self.result]
+
+    @cached_property
+    def usable(self) -> bool:
+        """Whether the elements may be used."""
+        return self.result == "successful" or self.result in WARNED
+
+    @cached_property
+    def m_q(self) -> float:
+        return float(self.orientation.m_q) if self.usable else np.nan
+
+    @cached_property
+    def sigma0(self) -> float:
+        return float(self.orientation.sigma0) if self.usable else np.nan
+
+    @cached_property
+    def points(self) -> list[dict[str, Any]]:
+        """The values of every point: q, the four corrections, redundancy number, model X Y Z, in_front."""
+        o = self.orientation
+        shown = self.usable or self.result == "points_behind_camera"
+        numbers = np.stack([o.parallax, *o.corrections, o.redundancy, *o.model])
+        if not shown:
+            numbers = np.full_like(numbers, np.nan)
+        elif not self.usable:
+            numbers[6:] = np.nan
+        keys = ("q", "v_x_left", "v_y_left", "v_x_right", "v_y_right", "redundancy", "X", "Y", "Z")
+        front = [bool(f) if shown else None for f in o.in_front]
+        return [
+            {"point": name, **dict(zip(keys, values, strict=True)), "in_front": f}
+            for name, values, f in zip(self.measured.points, numbers.T.tolist(), front, strict=True)
+        ]
+
+    @cached_property
+    def correlations(self) -> dict[str, float]:
+        """Correlation of every two elements, "first/second"; empty where not usable."""
+        if not self.usable:
+            return {}
+        q = self.orientation.cofactor
+        names = type(self.orientation.elements).names
+        deviations = np.sqrt(np.diagonal(q))
+        return {
+            f"{names[i]}/{names[j]}": float(q[i, j] / (deviations[i] * deviations[j]))
+            for i in range(5)
+            for j in range(i + 1, 5)
+        }
+
+
+@jax.jit
+@jax.vmap
+def _angles_and_base(pose: RelativePose, covariance):
+    """(bx, by, bz, omega, phi, kappa) of poses and their standard deviations, sqrt(diag(J C Jᵀ))."""
+
+    def values(step):
+        rotation, base = pose.moved(tuple(step)).relative()
+        return jnp.stack([*base, *rot.omega_phi_kappa(rot.transpose(rotation))])
+
+    zero = jnp.zeros(5, covariance.dtype)
+    jacobian = jax.jacfwd(values)(zero)
+    return values(zero), jnp.sqrt(jnp.einsum("ij,jk,ik->i", jacobian, covariance, jacobian))
+
+
+def shown_elements(orientations: list[Orientation], units: Units) -> list[list[Element]]:
+    """The elements of each orientation with their standard deviations: angles in degrees, lengths in model units.
+
+    Of a `RelativePose`: the unit base vector and the angles of M = R3(kappa) R2(phi) R1(omega).
+    """
+    system = type(orientations[0].elements)
+    covariances = [np.square(o.sigma0) * o.cofactor for o in orientations]
+    if system is RelativePose:
+        names, angles = ("bx", "by", "bz", "omega", "phi", "kappa"), (False,) * 3 + (True,) * 3
+        poses = jax.tree.map(lambda *a: np.stack(a), *[o.elements for o in orientations])
+        values, deviations = map(np.asarray, _angles_and_base(poses, np.stack(covariances)))
+    else:
+        names, angles = system.names, system.angles
+        values = np.array([[getattr(o.elements, name) for name in names] for o in orientations])
+        deviations = np.array([np.sqrt(np.diagonal(c)) for c in covariances])
+    scale = np.where(angles, 180 / np.pi, 1.0)
+    length = "" if system is RelativePose else units.model
+    kinds = ["deg" if angle else length for angle in angles]
+    out = []
+    for o, value, deviation in zip(orientations, (values * scale).tolist(), (deviations * scale).tolist(), strict=True):
+        given = [Element("bx", units.model, float(o.elements.bx), None)] if system is DependentElements else []
+        out.append(given + [Element(*entry) for entry in zip(names, kinds, value, deviation, strict=True)])
+    return out
+
+
+def solutions(
+    measured: list[Measurements],
+    cameras: list[tuple[Camera, Camera]],
+    orientations: list[Orientation],
+    units: Units,
+) -> list[Solution]:
+    """One `Solution` a pair, the elements of unusable ones NaN."""
+    out = []
+    for m, c, o, elements in zip(measured, cameras, orientations, shown_elements(orientations, units), strict=True):
+        solution = Solution(m, c, o, elements)
+        if not solution.usable:
+            blank = [Element(e.name, e.unit, np.nan, None if e.deviation is None else np.nan) for e in elements]
+            solution = Solution(m, c, o, blank)
+        out.append(solution)
+    return out
+
+

@@ -1,0 +1,200 @@
+"""Small normal equations, element by element, and the Gauss-Newton solver built on them.
+
+For p parameters the p(p+1)/2 + p + 1 sums N = JᵀJ, h = Jᵀr and rᵀr are accumulated by one variadic reduction over the
+residuals, so that no Jacobian is ever stored, and the system is solved by an unrolled Cholesky factorisation. Under
+`vmap` every operation is element-wise over the pairs: no LAPACK (which deadlocks from two threads) and no batched
+matrix product. Above `UNROLLED` parameters the dense routines take over.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+Scalars = Sequence[Scalar]
+Lower = list[list[Scalar]]
+"""Lower triangle of a symmetric matrix: row i has i + 1 entries."""
+
+UNROLLED = 12
+"""Largest number of parameters that is unrolled: beyond it the compiled program grows faster than it runs."""
+
+SINGULAR = 1e-12
+"""Relative pivot below which a parameter counts as undetermined by those before it."""
+
+
+@jax.custom_jvp
+def sums(arrays: tuple[Array, ...]) -> tuple[Scalar, ...]:
+    """The sums of equally long arrays, in one pass over all of them."""
+    zeros = tuple(jnp.zeros((), a.dtype) for a in arrays)
+    return tuple(lax.reduce(arrays, zeros, lambda p, q: tuple(a + b for a, b in zip(p, q, strict=True)), (0,)))
+
+
+@sums.defjvp
+def _sums_jvp(primals, tangents):
+    (arrays,), (moved,) = primals, tangents
+    return sums(arrays), tuple(jnp.sum(a) for a in moved)
+
+
+def columns(residual: Callable, x: Scalars) -> tuple[Float[Array, " residual"], list[Float[Array, " residual"]]]:
+    """Residuals r(x) and the columns dr/dx_k, by linearising once and pushing each unit vector forward."""
+    r, push = jax.linearize(lambda *y: residual(y).reshape(-1), *x)
+    unit = jnp.eye(len(x), dtype=r.dtype)
+    return r, [push(*(unit[k, i] for i in range(len(x)))) for k in range(len(x))]
+
+
+def accumulate(r: Array, jacobian: Sequence[Array], weight: Array | None = None) -> tuple[Lower, list[Scalar], Scalar]:
+    """N = JᵀWJ, h = JᵀWr and rᵀWr."""
+    weighted = [*jacobian, r] if weight is None else [weight * column for column in (*jacobian, r)]
+    p = len(jacobian)
+    products = [weighted[i] * jacobian[j] for i in range(p) for j in range(i + 1)]
+    products += [weighted[p] * column for column in jacobian] + [weighted[p] * r]
+    total = list(sums(tuple(products)))
+    n = [[total.pop(0) for _ in range(i + 1)] for i in range(p)]
+    return n, total[:p], total[p]
+
+
+def cholesky(n: Lower) -> tuple[Lower, Scalar]:
+    """L with N = L Lᵀ, the *inverses* of its diagonal in place of the diagonal, and the smallest relative pivot.
+
+    The relative pivot of a parameter is the part of its diagonal that those before it leave over; pivots below the
+    rounding level are lifted to it, so that a singular system gives a large but finite solution.
+    """
+    factor: Lower = []
+    smallest = jnp.ones_like(n[0][0])
+    for i, row in enumerate(n):
+        new: list[Scalar] = []
+        for j in range(i + 1):
+            s = row[j]
+            for k in range(j):
+                s = s - new[k] * (new if i == j else factor[j])[k]
+            if i > j:
+                new.append(s * factor[j][j])
+            else:
+                floor = jnp.finfo(s.dtype).eps * row[i] + jnp.finfo(s.dtype).tiny
+                smallest = jnp.minimum(smallest, s / (row[i] + jnp.finfo(s.dtype).tiny))
+                new.append(lax.rsqrt(jnp.maximum(s, floor)))
+        factor.append(new)
+    return factor, smallest
+
+
+def substitute(factor: Lower, h: Scalars) -> list[Scalar]:
+    """N⁻¹ h by forward and back substitution."""
+    x: list[Scalar] = []
+    for i, row in enumerate(factor):
+        s = h[i]
+        for k in range(i):
+            s = s - row[k] * x[k]
+        x.append(s * row[i])
+    for i in reversed(range(len(x))):
+        s = x[i]
+        for k in range(i + 1, len(x)):
+            s = s - factor[k][i] * x[k]
+        x[i] = s * factor[i][i]
+    return x
+
+
+def dense(n: Lower) -> Float[Array, "p p"]:
+    """The symmetric matrix as an array."""
+    p = len(n)
+    return jnp.stack([jnp.stack([n[max(i, j)][min(i, j)] for j in range(p)]) for i in range(p)])
+
+
+def solve(n: Lower, h: Scalars) -> list[Scalar]:
+    """N⁻¹ h."""
+    if len(h) > UNROLLED:
+        return list(jnp.linalg.solve(dense(n), jnp.stack(list(h))))
+    return substitute(cholesky(n)[0], h)
+
+
+def inverse(n: Lower) -> tuple[Lower, Scalar]:
+    """The lower triangle of N⁻¹ and the smallest relative pivot."""
+    p = len(n)
+    if p > UNROLLED:
+        scale = lax.rsqrt(jnp.stack([n[i][i] for i in range(p)]))
+        scaled = dense(n) * scale[:, None] * scale[None, :]
+        full = jnp.linalg.inv(scaled) * scale[:, None] * scale[None, :]
+        return [[full[i, j] for j in range(i + 1)] for i in range(p)], jnp.min(jnp.linalg.eigvalsh(scaled))
+    factor, pivot = lax.optimization_barrier(cholesky(n))  # else XLA expands it into every entry of the inverse
+    zero, one = jnp.zeros_like(n[0][0]), jnp.ones_like(n[0][0])
+    solved = [substitute(factor, [one if i == k else zero for i in range(p)]) for k in range(p)]
+    return [[solved[j][i] for j in range(i + 1)] for i in range(p)], pivot
+
+
+class GaussNewton(optx.AbstractLeastSquaresSolver):
+    """Gauss-Newton for a few parameters; its loop carries the parameters and two step sizes, nothing else.
+
+    Ends when the *next* step, predicted from the last two, is below atol + rtol |x|. `max_step` bounds the largest
+    component of a step (0.5 rad for orientations, where a longer one leaves the range of the linearisation).
+    """
+
+    rtol: float = 1e-10
+    atol: float = 1e-10
+    max_step: float = float("inf")
+    norm: Callable = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        dtype = jnp.result_type(*jax.tree.leaves(y))
+        return jnp.asarray(jnp.inf, dtype), jnp.zeros((), dtype)
+
+    def step(self, fn, y, args, options, state, tags):
+        leaves, structure = jax.tree.flatten(y)
+        residual = lambda x: ravel_pytree(fn(jax.tree.unflatten(structure, list(x)), args)[0])[0]
+        r, jacobian = columns(residual, leaves)
+        n, h, _ = accumulate(r, jacobian)
+        delta = solve(n, h)
+        longest = delta[0] * 0
+        for d in delta:
+            longest = jnp.maximum(longest, jnp.abs(d))
+        shrink = jnp.minimum(1.0, self.max_step / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny))
+        moved = [x - shrink * d for x, d in zip(leaves, delta, strict=True)]
+        size = longest * 0
+        for x, d in zip(moved, delta, strict=True):
+            size = jnp.maximum(size, jnp.abs(d) / (self.atol + self.rtol * jnp.abs(x)))
+        previous = state[1]
+        predicted = size * jnp.where(previous > 0, jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)), 1.0)
+        return jax.tree.unflatten(structure, moved), (predicted, size), None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        return state[0] < 1, optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return y, aux, {}
+
+
+class SmallCholesky(lx.AbstractLinearSolver):
+    """The unrolled Cholesky as a lineax solver, for the positive definite system of implicit differentiation."""
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
+        return operator.as_matrix()
+
+    def compute(self, state, vector, options):
+        flat, unravel = ravel_pytree(vector)
+        p = flat.shape[0]
+        lower = [[(state[i, j] + state[j, i]) / 2 for j in range(i + 1)] for i in range(p)]
+        return unravel(jnp.stack(solve(lower, [flat[i] for i in range(p)]))), lx.RESULTS.successful, {}
+
+    def transpose(self, state, options):
+        return state, options
+
+    def conj(self, state, options):
+        return state, options
+
+    def assume_full_rank(self):
+        return True
+
+
+def steps(residual: Callable, x: tuple[Scalar, ...], count: int, max_step: float) -> tuple[Scalar, ...]:
+    """A fixed number of Gauss-Newton steps, for starts that need no convergence test."""
+    solver = GaussNewton(max_step=max_step)
+
+    def body(_, x):
+        return solver.step(lambda y, _: (residual(y), None), x, None, {}, (x[0], x[0]), frozenset())[0]
+
+    return lax.fori_loop(0, count, body, x)

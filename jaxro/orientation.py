@@ -1,0 +1,273 @@
+"""Relative orientation of one measured stereo pair: the one call of the README."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax import lax
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from . import coplanarity, rotations as rot, starts
+from .adjustment import adjust
+from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
+from .losses import AbstractLoss
+from .normal_equations import GaussNewton
+from .pairs import Pair, cleaned
+from .results import RESULTS, is_usable
+
+WEAK = 0.2
+"""Standard deviation (rad) of a local parameter above which the linearised statistics no longer mean anything."""
+
+AT_INFINITY = 1e-3
+"""Base over distance below which a point counts as infinitely far, so that the sign of its depth says nothing."""
+
+PURE_ROTATION = 4.0
+"""Parallaxes below this many standard deviations are explained by a rotation alone."""
+
+
+class Orientation(eqx.Module):
+    """The relative orientation of a pair; for a batch every field has leading axes.
+
+    Per point (zero or False where masked): `parallax` the strict y-parallax q = y1* - y2* of the photos turned parallel
+    to the base; `residuals` the whitened residuals that were minimised; `corrections` the corrections v of (x_left,
+    y_left, x_right, y_right); `redundancy` numbers, which add up to the degrees of freedom; `model` (X, Y, Z) in the
+    frame and scale of the elements; `in_front` of both photos.
+
+    `m_q` = sqrt([qq]/(n-5)), `sigma0` = sqrt(Σ r²/(n-5)): the standard deviation of a coordinate in its own unit when
+    no sigma was given, else its ratio to the given sigma. Both NaN without redundancy. `cofactor`: of the five
+    elements in the order of `elements.names`; rad, and the unit of the base.
+    """
+
+    pose: RelativePose
+    elements: AbstractElements
+    cofactor: Float[Array, "5 5"]
+    parallax: Float[Array, " point"]
+    residuals: Float[Array, " point"]
+    corrections: coplanarity.Point
+    redundancy: Float[Array, " point"]
+    model: rot.Vector
+    in_front: Bool[Array, " point"]
+    m_q: Float[Array, ""]
+    sigma0: Float[Array, ""]
+    degrees_of_freedom: Int[Array, ""]
+    iterations: Int[Array, ""]
+    result: RESULTS
+
+    @property
+    def covariance(self) -> Float[Array, "5 5"]:
+        """sigma0² times the cofactors (a posteriori)."""
+        return self.sigma0[..., None, None] ** 2 * self.cofactor
+
+    @property
+    def deviations(self) -> Float[Array, "5"]:
+        """Standard deviations of the elements."""
+        return self.sigma0[..., None] * jnp.sqrt(jnp.diagonal(self.cofactor, axis1=-2, axis2=-1))
+
+    @property
+    def usable(self) -> Bool[Array, ""]:
+        """Whether the elements may be used; `result` says why not, or what to mind."""
+        return is_usable(self.result)
+
+    def check(self) -> "Orientation":
+        """This orientation; raises RuntimeError with advice if any of it is not usable."""
+        if not bool(jnp.all(self.usable)):
+            if jnp.ndim(self.usable) == 0:
+                raise RuntimeError(RESULTS[self.result])
+            raise RuntimeError(f"{int(jnp.sum(~self.usable))} of {self.usable.size} pairs are not oriented; see result")
+        return self
+
+
+def orient(
+    pair: Pair,
+    *,
+    elements: type[AbstractElements] = RelativePose,
+    base: ArrayLike | None = None,
+    residual: Callable[[Pair], coplanarity.Adjusted] = coplanarity.rigorous,
+    loss: AbstractLoss | None = None,
+    start: starts.AbstractStart | AbstractElements = starts.Auto(),  # noqa: B008 (frozen)
+    solver: optx.AbstractLeastSquaresSolver | None = None,
+    max_steps: int = 30,
+) -> Orientation:
+    """Orient the right photo of a pair to the left one by least squares (or a robust loss).
+
+    `elements`: the system of the result. `base`: bx of `DependentElements` (its sign says on which side the right photo
+    lies), b of `IndependentElements`; the mean x-parallax if not given. `RelativePose` has a unit base. `residual`:
+    `coplanarity.rigorous` or `coplanarity.parallax`. `start`: an object of `starts`, or known elements, which are then
+    also the parameters that are iterated. Works under jit, vmap and grad; failures are values of `result`.
+    """
+    if pair.x_left.ndim != 1:
+        raise ValueError(
+            f"orient takes one pair, but the coordinates have shape {pair.x_left.shape}: "
+            "use jax.vmap(orient), or orient_batch"
+        )
+    pair, bad_input = cleaned(pair)
+    begin = starts.Begin(start, False) if isinstance(start, AbstractElements) else start(pair)
+    condition, observations, cofactor = residual(pair)
+    adjustment = adjust(
+        condition,
+        begin.pose,
+        observations,
+        cofactor,
+        pair.mask,
+        loss=loss,
+        solver=GaussNewton(max_step=0.5) if solver is None else solver,
+        max_steps=max_steps,
+    )
+    solved = adjustment.parameters
+    pose, flipped = _facing(to_pose(solved), pair, isinstance(solved, RelativePose))
+    length = _length(pair, elements, base, pose)
+    chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
+
+    f = coplanarity.fundamental_matrix(pose, pair.focal_left, pair.focal_right)
+    each = lambda function: jax.vmap(function)(pair.coordinates, pair.mask)
+    v = each(lambda point, use: coplanarity.corrections(f, point, use))
+    frames = coplanarity.turned(pose)
+    parallax = each(
+        lambda point, use: jnp.where(
+            use, coplanarity.y_parallax(frames, point, pair.focal_left, pair.focal_right), 0.0
+        )
+    )
+    corrected = tuple(c + dv for c, dv in zip(pair.coordinates, v, strict=True))
+    scale = _scale(chosen, pose, length)
+    model, in_front, far = _model(pair, pose, corrected, rot.scaled_rows(chosen.model_frame(), scale))
+
+    freedom = adjustment.degrees_of_freedom
+    checked = freedom > 0
+    qq = jnp.sum(parallax**2) / jnp.where(checked, freedom, 1).astype(parallax.dtype)
+    m_q = jnp.where(checked, jnp.where(qq > 0, jnp.sqrt(jnp.where(qq > 0, qq, 1.0)), 0.0), jnp.nan)
+
+    result = adjustment.result
+    fair = result == RESULTS.successful
+    noise = jnp.where(checked, adjustment.sigma0, 0.0)
+    worst = jnp.max(jnp.diagonal(adjustment.cofactor))
+    for condition_holds, code in (
+        (freedom == 0, RESULTS.no_redundancy),
+        (begin.ambiguous, RESULTS.two_solutions),
+        (jnp.any(pair.mask & ~in_front & ~far), RESULTS.points_behind_camera),
+        (_undefined(elements, pose), RESULTS.elements_undefined),
+        (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
+        (noise**2 * worst > WEAK**2, RESULTS.weakly_determined),
+    ):
+        result = RESULTS.where(fair & condition_holds, code, result)
+    result = RESULTS.where(_pure_rotation(pair, pose, noise), RESULTS.zero_base, result)
+    result = RESULTS.where(freedom < 0, RESULTS.too_few_points, result)
+    result = RESULTS.where(bad_input, RESULTS.non_finite_input, result)
+    return Orientation(
+        pose,
+        chosen,
+        q,
+        parallax,
+        adjustment.residuals,
+        v,
+        adjustment.redundancy,
+        model,
+        in_front,
+        m_q,
+        adjustment.sigma0,
+        jnp.maximum(freedom, 0),
+        adjustment.iterations,
+        result,
+    )
+
+
+def _facing(pose: RelativePose, pair: Pair, free: bool) -> tuple[RelativePose, Bool[Array, ""]]:
+    """The pose with the sign of its base that puts most points in front: g does not know that sign."""
+    if not free:
+        return pose, jnp.zeros_like(pose.qw, bool)
+    rotation, base = pose.relative()
+
+    def side(point, use):
+        _, lam, mu = coplanarity.intersection(rotation, base, point, pair.focal_left, pair.focal_right)
+        return jnp.where(use, jnp.sign(lam) + jnp.sign(mu), 0.0)
+
+    turn = jnp.sum(jax.vmap(side)(pair.coordinates, pair.mask)) < 0
+    sign = jnp.where(turn, -1.0, 1.0)
+    return RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *rot.scaled(base, sign)), turn
+
+
+def _length(pair: Pair, system: type[AbstractElements], base: ArrayLike | None, pose: RelativePose):
+    """bx of the dependent system, b of the independent one: as given, else the mean x-parallax on the side of b."""
+    if system is RelativePose:
+        return jnp.ones_like(pose.bx)
+    if base is not None:
+        return jnp.broadcast_to(jnp.asarray(base, pose.bx.dtype), pose.bx.shape)
+    count = jnp.maximum(pair.count, 1.0)
+    mean = jnp.abs(jnp.sum(jnp.where(pair.mask, pair.x_left - pair.x_right, 0.0)) / count)
+    mean = lax.stop_gradient(jnp.where(mean > 1e-6 * pair.focal_left, mean, pair.focal_left))
+    return jnp.where((pose.bx < 0) & (system is DependentElements), -mean, mean)
+
+
+def _scale(chosen: AbstractElements, pose: RelativePose, length):
+    """Length of the base in the model of the chosen elements."""
+    if isinstance(chosen, DependentElements):
+        return length / pose.bx
+    return length
+
+
+def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractElements], length):
+    """The elements in the chosen system and their cofactors J Q Jᵀ."""
+    if type(solved) is system and system is not RelativePose:
+        return solved, cofactor
+    sign = jnp.where(flipped, -1.0, 1.0)
+
+    def at(step: tuple) -> AbstractElements:
+        pose = to_pose(solved.moved(step))
+        base = (pose.bx * sign, pose.by * sign, pose.bz * sign)
+        return convert(RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *base), system, length)
+
+    origin = (jnp.zeros_like(length),) * 5
+    if system is RelativePose:
+        return at(origin), cofactor
+    push = jax.linearize(lambda *x: jnp.stack(at(x).values()), *origin)[1]
+    jacobian = jax.vmap(push, out_axes=1)(*jnp.eye(5, dtype=cofactor.dtype))
+    right = jnp.sum(jacobian[:, :, None] * cofactor[None, :, :], axis=1)
+    return at(origin), jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
+
+
+def _model(pair: Pair, pose: RelativePose, corrected: coplanarity.Point, frame: rot.Matrix):
+    """Model points of the corrected coordinates, which of them lie in front, and which are infinitely far."""
+    rotation, base = pose.relative()
+
+    def one(point, use):
+        half, lam, mu = coplanarity.intersection(rotation, base, point, pair.focal_left, pair.focal_right)
+        near = jnp.minimum(jnp.abs(lam) * pair.focal_left, jnp.abs(mu) * pair.focal_right)
+        far = ~(near * AT_INFINITY < 1)
+        x, y, z = rot.apply(frame, half)
+        keep = use & jnp.isfinite(x) & jnp.isfinite(y) & jnp.isfinite(z)
+        return tuple(jnp.where(keep, c, 0.0) for c in (x, y, z)), use & (lam > 0) & (mu > 0), use & far
+
+    return jax.vmap(one)(corrected, pair.mask)
+
+
+def _pure_rotation(pair: Pair, pose: RelativePose, noise) -> Bool[Array, ""]:
+    """Whether the directions p1 and R p2 agree to within the measuring error: no parallax, hence no base."""
+    rotation, _ = pose.relative()
+
+    def one(x1, y1, x2, y2, sigma, use):
+        first = rot.unit((x1, y1, -pair.focal_left))
+        second = rot.unit(rot.apply(rotation, (x2, y2, -pair.focal_right)))
+        chord = rot.dot(rot.cross(first, second), rot.cross(first, second))
+        return jnp.where(use, chord * (pair.focal_left / sigma) ** 2, 0.0), jnp.where(use, 1 / sigma**2, 0.0)
+
+    squared, weight = jax.vmap(one)(*pair.coordinates, pair.sigma, pair.mask)
+    count = jnp.maximum(pair.count, 1.0)
+    rounding = 1e-9 * pair.focal_left * jnp.sqrt(jnp.sum(weight) / count)
+    return jnp.sqrt(jnp.sum(squared) / count) < PURE_ROTATION * noise + rounding
+
+
+def _undefined(system: type[AbstractElements], pose: RelativePose) -> Bool[Array, ""]:
+    """Whether the named elements do not exist at this pose."""
+    if system is DependentElements:
+        return jnp.abs(pose.bx) < 1e-6
+    if system is IndependentElements:
+        return jnp.hypot(pose.bx, pose.by) < 1e-6
+    return jnp.zeros_like(pose.bx, bool)
+
+
+def _wrong_side(system: type[AbstractElements], base: ArrayLike | None, pose: RelativePose) -> Bool[Array, ""]:
+    """Whether the given bx points away from where the right photo lies."""
+    if system is not DependentElements or base is None:
+        return jnp.zeros_like(pose.bx, bool)
+    return pose.bx * jnp.asarray(base, pose.bx.dtype) < 0

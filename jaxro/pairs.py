@@ -1,0 +1,179 @@
+"""Measured stereo pairs: image coordinates, their standard deviations, a mask, two focal lengths.
+
+Photo coordinates are right-handed, x along the flight, y up, origin at the principal point, in mm (or in px with the
+focal length in px); the image vector is p = (x, y, -f). Left and right x and y are separate arrays, points last, so
+that a batch of pairs is arithmetic on flat arrays. Points that do not exist are zeros with mask False, never NaN.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+Coordinates = tuple[Float[Array, "*pairs point"], ...]
+"""x_left, y_left, x_right, y_right"""
+
+
+class Camera(eqx.Module):
+    """From measured image coordinates to photo coordinates; used at the edge, never inside the engine.
+
+        x = (u - u0) * pixel_size,    y = ±(v - v0) * pixel_size    (minus where rows count downwards)
+
+    `focal` is in photo units (mm, or px when pixel_size is 1); `principal_point` in measured units.
+    """
+
+    focal: float
+    principal_point: tuple[float, float] = (0.0, 0.0)
+    pixel_size: float = 1.0
+    y_down: bool = False
+
+    def __check_init__(self):
+        for name, value in (("focal", self.focal), ("pixel_size", self.pixel_size)):
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"Camera: {name} must be a positive number, got {value!r}")
+        if len(self.principal_point) != 2 or not np.all(np.isfinite(self.principal_point)):
+            raise ValueError(f"Camera: principal_point must be two numbers, got {self.principal_point!r}")
+
+    def to_photo(self, u: ArrayLike, v: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Photo coordinates (x right, y up, origin at the principal point) of measured ones."""
+        sign = -1.0 if self.y_down else 1.0
+        u0, v0 = self.principal_point
+        return (jnp.asarray(u) - u0) * self.pixel_size, sign * (jnp.asarray(v) - v0) * self.pixel_size
+
+
+class Pair(eqx.Module):
+    """One measured stereo pair, or a batch of them (leading axes on every field).
+
+    `sigma` is the standard deviation of each of the four coordinates of a point; 1 means unit weight, and sigma0 is
+    then the standard deviation of a coordinate in the unit of the coordinates.
+    """
+
+    x_left: Float[Array, "*pairs point"]
+    y_left: Float[Array, "*pairs point"]
+    x_right: Float[Array, "*pairs point"]
+    y_right: Float[Array, "*pairs point"]
+    sigma: Float[Array, "*pairs point"]
+    mask: Bool[Array, "*pairs point"]
+    focal_left: Float[Array, "*pairs"]
+    focal_right: Float[Array, "*pairs"]
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """(x_left, y_left, x_right, y_right)"""
+        return self.x_left, self.y_left, self.x_right, self.y_right
+
+    @property
+    def count(self) -> Float[Array, "*pairs"]:
+        """Number of points that take part, as a float."""
+        return jnp.sum(self.mask, axis=-1, dtype=self.x_left.dtype)
+
+    def with_mask(self, mask: Bool[Array, "*pairs point"]) -> "Pair":
+        """The same pair with other points taking part."""
+        return eqx.tree_at(lambda pair: pair.mask, self, mask)
+
+
+def pair(
+    x_left: ArrayLike,
+    y_left: ArrayLike,
+    x_right: ArrayLike,
+    y_right: ArrayLike,
+    *,
+    focal: ArrayLike | tuple[ArrayLike, ArrayLike],
+    sigma: ArrayLike | None = None,
+    weight: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+) -> Pair:
+    """A `Pair` from four equally long coordinate arrays (leading batch axes allowed).
+
+    `focal`: one focal length, or (left, right). `sigma`: standard deviation of a coordinate, per point or for all
+    (default 1). `weight`: relative weights, sigma / sqrt(weight); weight 0 leaves the point out.
+    Raises ValueError where the shapes do not agree.
+    """
+    dtype = jnp.result_type(float)
+    coordinates = [jnp.asarray(c, dtype) for c in (x_left, y_left, x_right, y_right)]
+    shape = coordinates[0].shape
+    if len(shape) == 0:
+        raise ValueError("pair: coordinates must be arrays with the points on the last axis, got single numbers")
+    for name, c in zip(("y_left", "x_right", "y_right"), coordinates[1:], strict=True):
+        if c.shape != shape:
+            raise ValueError(f"pair: {name} has shape {c.shape}, x_left has {shape}; all four must agree")
+    try:
+        taking_part = jnp.broadcast_to(jnp.asarray(True if mask is None else mask, bool), shape)
+        deviation = jnp.broadcast_to(jnp.asarray(1.0 if sigma is None else sigma, dtype), shape)
+        if weight is not None:
+            relative = jnp.broadcast_to(jnp.asarray(weight, dtype), shape)
+            taking_part = taking_part & (relative != 0)
+            deviation = deviation / jnp.sqrt(jnp.where(relative == 0, 1.0, relative))
+    except ValueError as error:
+        raise ValueError(f"pair: mask, sigma and weight must fit the coordinates' shape {shape}: {error}") from None
+    left, right = focal if isinstance(focal, tuple) else (focal, focal)
+    focals = [jnp.broadcast_to(jnp.asarray(f, dtype), shape[:-1]) for f in (left, right)]
+    return Pair(*coordinates, deviation, taking_part, *focals)
+
+
+def pad(one: Pair, points: int) -> Pair:
+    """The pair with zeros up to `points` places, masked out. Raises ValueError if it has more."""
+    missing = points - one.x_left.shape[-1]
+    if missing < 0:
+        raise ValueError(f"pad: the pair has {one.x_left.shape[-1]} points, more than {points}")
+    widths = [(0, 0)] * (one.x_left.ndim - 1) + [(0, missing)]
+    coordinates = [jnp.pad(c, widths) for c in one.coordinates]
+    return Pair(
+        *coordinates,
+        jnp.pad(one.sigma, widths, constant_values=1.0),
+        jnp.pad(one.mask, widths),
+        one.focal_left,
+        one.focal_right,
+    )
+
+
+def stack(pairs: Sequence[Pair]) -> Pair:
+    """One batch of many single pairs, padded to the longest."""
+    if not pairs:
+        raise ValueError("stack: no pairs given")
+    longest = max(one.x_left.shape[-1] for one in pairs)
+    return jax.tree.map(lambda *fields: jnp.stack(fields), *[pad(one, longest) for one in pairs])
+
+
+def unstack(batch: Pair) -> list[Pair]:
+    """The single pairs of a batch, padding left in place."""
+    return [jax.tree.map(lambda field, i=i: field[i], batch) for i in range(batch.x_left.shape[0])]
+
+
+def swapped(one: Pair) -> Pair:
+    """The same pair with left and right exchanged."""
+    return Pair(
+        one.x_right,
+        one.y_right,
+        one.x_left,
+        one.y_left,
+        one.sigma,
+        one.mask,
+        one.focal_right,
+        one.focal_left,
+    )
+
+
+def cleaned(one: Pair) -> tuple[Pair, Bool[Array, "*pairs"]]:
+    """The pair with non-finite points masked and zeroed, and whether anything had to be left out.
+
+    Masked points are set to zero coordinates and unit sigma whatever they held, so that nothing they hold can reach a
+    result or a derivative.
+    """
+    finite = (one.sigma > 0) & jnp.isfinite(one.sigma)
+    for c in one.coordinates:
+        finite = finite & jnp.isfinite(c)
+    use = one.mask & finite
+    focals = [one.focal_left, one.focal_right]
+    focal_ok = [jnp.isfinite(f) & (f > 0) for f in focals]
+    bad = jnp.any(one.mask & ~finite, axis=-1) | ~focal_ok[0] | ~focal_ok[1]
+    repaired = Pair(
+        *(jnp.where(use, c, 0.0) for c in one.coordinates),
+        jnp.where(use, one.sigma, 1.0),
+        use,
+        *(jnp.where(ok, f, 1.0) for ok, f in zip(focal_ok, focals, strict=True)),
+    )
+    return repaired, bad

@@ -1,0 +1,65 @@
+"""Every way an orientation or adjustment can end, with advice.
+
+A result is a value, never an exception: inside a batch one bad pair must not harm its neighbours.
+`RESULTS[result]` gives the sentence of one member; `Orientation.check()` raises it for callers who want that.
+"""
+
+import optimistix as optx
+from jaxtyping import Array, Bool
+
+
+class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How an adjustment ended. Members after `two_solutions` mean: do not use the elements."""
+
+    successful = ""
+    no_redundancy = (
+        "Exactly five points: the elements are determined but nothing checks them, so m_q and sigma0 do not exist. "
+        "Measure at least one more point."
+    )
+    two_solutions = (
+        "A second orientation fits the points as well, with all of them in front of both photos: the points lie "
+        "(nearly) in one plane, or are too few. The better one is returned. Give an approximate start, or measure "
+        "points off the plane."
+    )
+    too_few_points = "Fewer than five usable points: relative orientation has five unknowns. Measure more points."
+    non_finite_input = (
+        "A coordinate, standard deviation or focal length is NaN or infinite (or not positive where it must be). "
+        "The point was left out; correct or mask it and orient again."
+    )
+    rank_deficient = (
+        "The layout does not determine the five elements (points on a line, in one zone, or a needed zone is empty). "
+        "Add points in the empty zones."
+    )
+    weakly_determined = (
+        "The elements follow from the points only with a standard deviation above 0.2 rad: the layout is too small or "
+        "too one-sided for its accuracy. Add points far from the present ones."
+    )
+    zero_base = (
+        "The photos are explained by a pure rotation: the base is zero (or every point is far away), so neither base "
+        "direction nor model points exist. Use photos taken from different places."
+    )
+    points_behind_camera = (
+        "At least one point lies behind a photo: a wrong match, a sign error in the coordinates, or a wrong solution. "
+        "`in_front` names the points."
+    )
+    photos_swapped = (
+        "The right photo lies on the other side of the left one than the given base says: "
+        "swap left and right, or give a negative base."
+    )
+    elements_undefined = (
+        "The chosen elements do not exist here: the base is at right angles to the x axis (or photo axis) they divide "
+        "by. Use RelativePose, which exists for every position."
+    )
+    diverged = (
+        "The iterations did not converge. Look for gross errors in the coordinates, the focal lengths and the axes "
+        "(y up), or give a start."
+    )
+
+
+def is_usable(result: RESULTS) -> Bool[Array, "..."]:
+    """True where the elements may be used: successful, no_redundancy or two_solutions (with their warnings)."""
+    return (
+        (result == RESULTS.successful)  # pyright: ignore[reportReturnType]
+        | (result == RESULTS.no_redundancy)
+        | (result == RESULTS.two_solutions)
+    )

@@ -1,0 +1,15 @@
+"""Ways to begin, one file each; every one needs nothing but the pair.
+
+| start | points | what it does |
+|---|---|---|
+| `Vertical` | 5 | parallel axes, base along x: zero elements, the normal case of aerial photography |
+| `General` | 5 | any position: five-point and eight-point solutions, chosen by cheirality and residual |
+| `Auto` | 5 | `Vertical` where two steps from it fit, `General` for the rest |
+
+Known elements are a start, too: pass them instead.
+"""
+
+from .auto import Auto as Auto
+from .base import AbstractStart as AbstractStart, Begin as Begin
+from .general import General as General
+from .vertical import Vertical as Vertical

@@ -1,0 +1,51 @@
+"""Near-vertical photos go straight to Gauss-Newton, everything else through the general start."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from ..elements import vertical
+from ..normal_equations import steps
+from ..pairs import Pair
+from .base import AbstractStart, Begin, distances, rms_distance
+from .general import General
+
+
+class Auto(AbstractStart):
+    """Two Gauss-Newton steps from the vertical; where they fit, that is the start, elsewhere `general`.
+
+    "Fit" means: rotation and base within `tilt` (rad) of the normal case and a root mean square distance below
+    `tolerance` times the focal length, far above any measuring error and far below what a wrong orientation leaves.
+    Of the two solutions of an exactly plane scene this takes the one near the normal case without mention; pass
+    `General()` where photos in other positions look at a plane.
+    """
+
+    general: AbstractStart = General()
+    steps: int = 2
+    tilt: float = 0.35
+    tolerance: float = 1e-3
+
+    def __call__(self, pair: Pair) -> Begin:
+        zero = jnp.zeros_like(pair.focal_left)
+        pose = vertical(pair.focal_left)
+        x = steps(distances(pair, pose), (zero,) * 5, self.steps, 0.5)
+        near = pose.moved(x).normalised()
+        longest = jnp.abs(x[0])
+        for entry in x[1:]:
+            longest = jnp.maximum(longest, jnp.abs(entry))
+        fits = (longest < self.tilt) & (rms_distance(pair, near) < self.tolerance)
+
+        # A loop of at most one round: under vmap it is entered only if some pair of the batch needs it, where a
+        # `cond` would be turned into a `select` and always compute the general start of every pair.
+        def needed(state):
+            return state[0]
+
+        def general(state) -> tuple:
+            begin = self.general(pair)
+            pick = lambda new, old: jnp.where(state[0], new, old)
+            return jnp.zeros_like(state[0]), jax.tree.map(pick, begin.pose, state[1]), begin.ambiguous & state[0]
+
+        _, pose, ambiguous = lax.while_loop(needed, general, (~fits, near, jnp.zeros_like(fits)))
+        return Begin(pose, ambiguous)
+
+

@@ -1,0 +1,43 @@
+"""What every start returns."""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .. import coplanarity
+from ..adjustment import moved, residual_function
+from ..elements import RelativePose
+from ..pairs import Pair
+
+
+class Begin(NamedTuple):
+    """A pose to begin with, and whether another one fits the points as well."""
+
+    pose: RelativePose
+    ambiguous: Bool[Array, ""]
+
+
+class AbstractStart(eqx.Module):
+    """A way to begin the adjustment of one pair (finite coordinates, masked points zero)."""
+
+    @abc.abstractmethod
+    def __call__(self, pair: Pair) -> Begin:
+        """The pose to begin with."""
+
+
+def distances(pair: Pair, pose: RelativePose):
+    """x -> distances of the points from the condition, in the unit of the coordinates, at the displaced pose."""
+    condition, observations, _ = coplanarity.rigorous(pair)
+    unit = (jnp.ones_like(pair.sigma),) * 4
+    residuals = residual_function(condition, observations, unit, pair.mask)
+    return lambda x: residuals(moved(pose, x))
+
+
+def rms_distance(pair: Pair, pose: RelativePose) -> Float[Array, ""]:
+    """Root mean square of `distances` at the pose, over the focal length."""
+    zero = jnp.zeros_like(pair.focal_left)
+    r = distances(pair, pose)((zero,) * 5)
+    return jnp.sqrt(jnp.sum(r * r) / jnp.maximum(pair.count, 1.0)) / pair.focal_left

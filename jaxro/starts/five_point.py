@@ -1,0 +1,280 @@
+"""All real essential matrices through five points (Nister 2004, An efficient solution to the five-point problem).
+
+Five points leave E = x E1 + y E2 + z E3 + w E4. The ten cubic equations
+
+    det E = 0,    2 E Eᵀ E - tr(E Eᵀ) E = 0
+
+are reduced to one polynomial of degree ten in z / w; each of its real roots is one essential matrix, made exact by
+Gauss-Newton steps on the cubic equations themselves.
+
+Nothing here calls LAPACK or indexes by a computed number. Arrays carry the problems on their last axis, the one along
+which a processor works, whatever `vmap` does outside (`_solve` has its own batching rule). Degenerate points give
+fewer solutions or inexact ones, never NaN.
+"""
+
+from itertools import combinations_with_replacement
+from math import comb
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool, Float
+
+TINY = 1e-300
+BISECTIONS = 6
+POLISHING = 2
+RISES = ((1, 2, 3, 4), (5, 6, 7), (8, 9, 10))
+# x y z w are the letters 0 1 2 3; the first ten monomials are eliminated (Nister's order)
+MONOMIALS = "000 111 001 011 002 003 112 113 012 013 022 023 033 122 123 133 222 223 233 333".split()
+SQUARES = tuple(combinations_with_replacement(range(4), 2))
+
+
+def five_point(
+    left: Float[Array, "5 3"], right: Float[Array, "5 3"]
+) -> tuple[Float[Array, "10 3 3"], Bool[Array, "10"]]:
+    """Every E with p1ᵀ E p2 = 0 for the five points, tr(E Eᵀ) = 2, and which of the ten places hold one.
+
+    Image vectors of any length. Places without a solution hold finite numbers without meaning.
+    """
+    essentials, real = _solve(left[..., None], right[..., None])
+    return jnp.moveaxis(essentials[..., 0], -1, 0), real[..., 0]
+
+
+@custom_vmap
+def _solve(left: Float[Array, "5 3 problem"], right: Float[Array, "5 3 problem"]):
+    basis = _null_space((left[:, :, None] * right[:, None, :]).reshape(5, 9, -1)).reshape(4, 3, 3, -1)
+    matrix = _elimination(_constraints(basis))
+    z, w, real = _real_roots(_determinant(matrix))
+    solutions = _polished(basis, _coefficients(matrix, z, w))
+    essentials = jnp.sum(basis[:, :, :, None] * solutions[:, None, None], axis=0)
+    return essentials * jnp.sqrt(2.0), real
+
+
+@_solve.def_vmap
+def _solve_batch(axis_size, in_batched, left, right):
+    """Any vmap from outside only makes the last axis longer."""
+    first, second = (
+        (p if batched else jnp.broadcast_to(p[None], (axis_size, *p.shape))).transpose(1, 2, 0, 3).reshape(5, 3, -1)
+        for p, batched in zip((left, right), in_batched, strict=True)
+    )
+    outputs = [jnp.moveaxis(a.reshape(*a.shape[:-1], axis_size, -1), -2, 0) for a in _solve(first, second)]
+    return tuple(outputs), (True, True)
+
+
+def _reflector(x: Float[Array, "n problem"]) -> Float[Array, "n problem"]:
+    """The Householder vector v that turns x onto its first axis, scaled so that H = I - v vᵀ."""
+    length = jnp.sqrt(jnp.sum(x * x, axis=0))
+    first = x[0] + jnp.where(x[0] < 0, -length, length)
+    scale = lax.rsqrt(jnp.maximum(length * jnp.abs(first), TINY))
+    return jnp.concatenate([first[None], x[1:]]) * scale[None]
+
+
+def _reflected(v: Float[Array, "n problem"], m: Float[Array, "n k problem"]) -> Float[Array, "n k problem"]:
+    return m - v[:, None] * jnp.sum(v[:, None] * m, axis=0)[None]
+
+
+def _null_space(rows: Float[Array, "5 9 problem"]) -> Float[Array, "4 9 problem"]:
+    """Four orthonormal vectors at right angles to the five rows: the last columns of Q in rowsᵀ = Q R."""
+    m, reflectors = jnp.swapaxes(rows, 0, 1), []
+    for _ in range(5):
+        reflectors.append(_reflector(m[:, 0]))
+        m = _reflected(reflectors[-1], m[:, 1:])[1:]
+    basis = jnp.broadcast_to(jnp.eye(4, dtype=rows.dtype)[:, :, None], (4, 4, rows.shape[-1]))
+    for v in reversed(reflectors):
+        basis = _reflected(v, jnp.pad(basis, ((1, 0), (0, 0), (0, 0))))
+    return jnp.swapaxes(basis, 0, 1)
+
+
+def _constraints(basis: Float[Array, "4 3 3 problem"]) -> Float[Array, "10 20 problem"]:
+    """The coefficients of the ten cubics (nine of the trace equation, one of the determinant) in the monomials."""
+    one = jnp.stack([basis[i] for i, _ in SQUARES])
+    two = jnp.stack([basis[j] for _, j in SQUARES])
+    half = jnp.asarray([0.5 if i == j else 1.0 for i, j in SQUARES], basis.dtype)[:, None, None, None]
+    outer = jnp.sum(one[:, :, None] * two[:, None], axis=3) * half
+    symmetric = outer + jnp.swapaxes(outer, 1, 2)
+    identity = jnp.eye(3, dtype=basis.dtype)[None, :, :, None]
+    trace = symmetric[:, 0, 0] + symmetric[:, 1, 1] + symmetric[:, 2, 2]
+    symmetric = symmetric - identity * (trace / 2)[:, None, None]
+    # term [square, letter]: (E Eᵀ - tr/2) E and row0 . (row1 x row2)
+    cubic = jnp.sum(symmetric[:, None, :, :, None] * basis[None, :, None], axis=3).reshape(10, 4, 9, -1)
+    normal = (_cross(one[:, 1], two[:, 2], 1) + _cross(two[:, 1], one[:, 2], 1)) * half[:, 0]
+    determinant = jnp.sum(normal[:, None] * basis[None, :, 0], axis=2)
+    terms = jnp.concatenate([cubic, determinant[:, :, None]], axis=2)
+    columns = dict.fromkeys(MONOMIALS, 0.0)
+    for p, (i, j) in enumerate(SQUARES):
+        for k in range(4):
+            columns["".join(sorted(f"{i}{j}{k}"))] += terms[p, k]
+    return jnp.stack([columns[m] for m in MONOMIALS], axis=1)
+
+
+def _elimination(m: Float[Array, "10 20 problem"]) -> Float[Array, "3 3 5 problem"]:
+    """B(z): three equations B (x, y, 1)ᵀ = 0, [equation, unknown, power of z], from the last six reduced rows."""
+    rows = []
+    for _ in range(10):
+        v = _reflector(m[:, 0])
+        head = m[0] - v[:1] * jnp.sum(v[:, None] * m, axis=0)
+        rows.append(head)
+        m = _reflected(v, m[:, 1:])[1:]
+    reduced: list = [None] * 10
+    for k in reversed(range(4, 10)):
+        row = rows[k][10 - k :]
+        for j in range(k + 1, 10):
+            row = row - rows[k][j - k : j - k + 1] * reduced[j]
+        pivot = rows[k][:1]
+        reduced[k] = row / jnp.where(jnp.abs(pivot) > TINY, pivot, TINY)
+    blocks = []
+    for k in (4, 6, 8):
+        # z times the second row of the two moves its powers up by one
+        e, f = (jnp.stack([_ascending(r, 0, 3), _ascending(r, 3, 3), _ascending(r, 6, 4)]) for r in reduced[k : k + 2])
+        blocks.append(jnp.pad(e, ((0, 0), (0, 1), (0, 0))) - jnp.pad(f, ((0, 0), (1, 0), (0, 0))))
+    return jnp.stack(blocks)
+
+
+def _ascending(row: Float[Array, "10 problem"], start: int, count: int) -> Float[Array, "4 problem"]:
+    return jnp.pad(row[start : start + count][::-1], ((0, 4 - count), (0, 0)))
+
+
+def _determinant(b: Float[Array, "3 3 5 problem"]) -> Float[Array, "11 problem"]:
+    """det B(z), ascending powers, largest coefficient 1."""
+
+    def times(p, q):
+        n = p.shape[1] + q.shape[1] - 1
+        return sum(p[:, i : i + 1] * jnp.pad(q, ((0, 0), (i, n - i - q.shape[1]), (0, 0))) for i in range(p.shape[1]))
+
+    x, y = b[:, 0, :4], b[:, 1, :4]
+    rolled = [jnp.concatenate([p[i:], p[:i]]) for p in (x, y) for i in (1, 2)]
+    minors = times(rolled[0], rolled[3]) - times(rolled[1], rolled[2])
+    c = jnp.sum(times(b[:, 2], minors), axis=0)
+    return c / jnp.maximum(jnp.max(jnp.abs(c), axis=0, keepdims=True), TINY)
+
+
+def _real_roots(c: Float[Array, "11 problem"]):
+    """(z, w), max(|z|, |w|) = 1, and which of ten places hold a real root of the sum of c_k z^k w^(10-k).
+
+    The roots with |z| <= |w| lie in [-1, 1] after w = 1, the others after z = 1. In [-1, 1] the roots of a polynomial
+    lie between those of its derivative (Rolle), so from the linear derivative upwards every root has its bracket.
+    Each pass of `RISES` treats its degrees with arrays of the size of the highest; unused places stay at 1.
+    """
+    halves = jnp.stack([c, c[::-1]], axis=1)[:, :, None]
+    roots = jnp.ones((2, 0, c.shape[1]), c.dtype)
+    for degrees in RISES:
+        top = degrees[-1]
+        weights = [[comb(j + 10 - d, j) if j <= d else 0 for j in range(top + 1)] for d in degrees]
+        weights = jnp.asarray(weights, c.dtype)[:, :, None, None, None]
+        shifted = [jnp.pad(halves[10 - d :], ((0, top - d), (0, 0), (0, 0), (0, 0))) for d in degrees]
+        roots = jnp.pad(roots, ((0, 0), (0, top - roots.shape[1]), (0, 0)), constant_values=1.0)
+        numbers = jnp.asarray(degrees, c.dtype)
+        roots, found = lax.scan(_risen, roots, (jnp.stack(shifted) * weights, numbers))
+    one = jnp.ones_like(roots)
+    z = jnp.stack([roots[0], one[1]]).reshape(20, -1)
+    w = jnp.stack([one[0], roots[1]]).reshape(20, -1)
+    found = found[-1].reshape(20, -1)
+    place = jnp.stack([jnp.sum(found[:i], axis=0) for i in range(20)])
+    chosen = found[None] & (place[None] == jnp.arange(10)[:, None, None])
+    real = jnp.any(chosen, axis=1)
+    z, w = (jnp.sum(jnp.where(chosen, value[None], 0.0), axis=1) for value in (z, w))
+    return jnp.where(real, z, 1.0), w, real
+
+
+def _risen(roots: Float[Array, "2 n problem"], polynomial):
+    """The roots of a polynomial in [-1, 1] from those of its derivative; a bracket without one gives its better end."""
+    c, degree = polynomial
+    edge = jnp.ones_like(roots[:, :1])
+    knots = jnp.concatenate([-edge, roots], axis=1)
+
+    def expansion(x):
+        """Value, slope and half the curvature (Horner)."""
+        p, d, s = c[-1] * jnp.ones_like(x), jnp.zeros_like(x), jnp.zeros_like(x)
+        for k in reversed(range(c.shape[0] - 1)):
+            s, d, p = s * x + d, d * x + p, p * x + c[k]
+        return p, d, s
+
+    a, b = knots[:, :-1], knots[:, 1:]
+    value, _, bend = lax.optimization_barrier(expansion(knots))
+    low, high = value[:, :-1], value[:, 1:]
+    rising = high >= 0
+    found = (low >= 0) != rising
+    lower = jnp.abs(low) < jnp.abs(high)
+    better = jnp.where(lower, a, b)
+    # the ends are extremes of p, except for -1 and 1: start on the parabola of the end nearer to zero
+    p, s = jnp.where(lower, low, high), jnp.where(lower, bend[:, :-1], bend[:, 1:])
+    reach = jnp.sqrt(jnp.abs(p) / jnp.maximum(jnp.abs(s), TINY))
+    x = jnp.where(reach < (b - a) / 2, jnp.where(lower, a + reach, b - reach), (a + b) / 2)
+
+    def step(_, state):
+        """Laguerre's step, cubically convergent; the middle of the bracket where it leads far out of it."""
+        a, b, x = state
+        p, d, s = expansion(x)
+        above = (p >= 0) == rising
+        a, b = jnp.where(above, a, x), jnp.where(above, x, b)
+        root = jnp.sqrt(jnp.maximum((degree - 1) ** 2 * d * d - 2 * degree * (degree - 1) * p * s, 0.0))
+        slope = d + jnp.where(d < 0, -root, root)
+        correction = degree * p / jnp.where(jnp.abs(slope) > TINY, slope, TINY)
+        inside = jnp.clip(x - correction, a, b)
+        return a, b, jnp.where(jnp.abs(correction) <= b - a, inside, (a + b) / 2)
+
+    x = lax.fori_loop(0, BISECTIONS, step, (a, b, x))[2]
+    return jnp.where(found, x, better), found
+
+
+def _cross(a: Array, b: Array, axis: int) -> Array:
+    """a x b along one axis of three."""
+    a0, a1, a2 = (lax.index_in_dim(a, i, axis, keepdims=False) for i in range(3))
+    b0, b1, b2 = (lax.index_in_dim(b, i, axis, keepdims=False) for i in range(3))
+    return jnp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=axis)
+
+
+def _coefficients(b: Float[Array, "3 3 5 problem"], z: Float[Array, "10 problem"], w: Float[Array, "10 problem"]):
+    """(x, y, z, w) of every root: the null vector of B, the longest cross product of two of its rows."""
+
+    def value(c):
+        total, power = c[:, :, -1], jnp.ones_like(w)
+        for k in reversed(range(c.shape[2] - 1)):
+            power = power * w
+            total = total * z[None, None] + c[:, :, k] * power[None, None]
+        return total
+
+    b = b[:, :, :, None]
+    rows = jnp.concatenate([value(b[:, :2, :4]), value(b[:, 2:])], axis=1)
+    rows = rows / jnp.maximum(jnp.max(jnp.abs(rows), axis=(0, 1), keepdims=True), TINY)
+    normals = _cross(rows, jnp.concatenate([rows[1:], rows[:1]]), 1)
+    lengths = jnp.sum(normals * normals, axis=1)
+    n = jnp.where((lengths[1] > lengths[0])[None], normals[1], normals[0])
+    n = jnp.where((lengths[2] > jnp.maximum(lengths[0], lengths[1]))[None], normals[2], n)
+    a = jnp.stack([n[0], n[1], n[2] * z, n[2] * w])
+    return _unit(a)
+
+
+def _unit(a: Float[Array, "4 10 problem"]) -> Float[Array, "4 10 problem"]:
+    return a * lax.rsqrt(jnp.maximum(jnp.sum(a * a, axis=0), TINY))[None]
+
+
+def _polished(basis: Float[Array, "4 3 3 problem"], a: Float[Array, "4 10 problem"]) -> Float[Array, "4 10 problem"]:
+    """Gauss-Newton on F = (E Eᵀ - tr(E Eᵀ)/2 I) E = 0 over the four coefficients, |a| = 1."""
+    basis = basis[:, :, :, None]
+    identity = jnp.eye(3, dtype=a.dtype)[:, :, None, None]
+
+    def step(_, a):
+        e = jnp.sum(basis * a[:, None, None], axis=0)
+        outer = jnp.sum(e[:, None] * e[None], axis=2)
+        m = outer - identity * (outer[0, 0] + outer[1, 1] + outer[2, 2])[None, None] / 2
+        f = jnp.sum(m[:, :, None] * e[None], axis=1)
+        half = jnp.sum(basis[:, :, None] * e[None, None], axis=3)
+        trace = half[:, 0, 0] + half[:, 1, 1] + half[:, 2, 2]
+        dm = half + jnp.swapaxes(half, 1, 2) - identity[None] * trace[:, None, None]
+        j = jnp.sum(dm[:, :, :, None] * e[None, None] + m[None, :, :, None] * basis[:, None], axis=2)
+        normal = jnp.sum(j[:, None] * j[None], axis=(2, 3)) + a[:, None] * a[None]
+        return _unit(a - _solve_four(normal, jnp.sum(j * f[None], axis=(1, 2))))
+
+    return lax.fori_loop(0, POLISHING, step, a)
+
+
+def _solve_four(n: Float[Array, "4 4 10 problem"], r: Float[Array, "4 10 problem"]) -> Float[Array, "4 10 problem"]:
+    """n⁻¹ r by elimination without pivots (n is positive definite)."""
+    m = jnp.concatenate([n, r[:, None]], axis=1)
+    for k in range(4):
+        pivot = m[k] / jnp.maximum(m[k, k : k + 1], 1e-30)
+        m = m - m[:, k : k + 1] * pivot[None]
+        m = jnp.concatenate([m[:k], pivot[None], m[k + 1 :]])
+    return m[:, 4]

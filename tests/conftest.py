@@ -1,0 +1,27 @@
+"""Strict settings for every test, shapes checked at run time, and the folder of measured data."""
+
+import os
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+# has to come before the first import of the package, in this process and for its submodules
+install_import_hook("jaxro", "beartype.beartype")
+
+import jax  # noqa: E402
+
+import jaxro  # noqa: E402, F401  (64 bit)
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of measured pairs; tests that need it say so when it is not there."""
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("JAXRO_DATA", beside))
+    if not folder.is_dir():
+        pytest.skip(f"no measured data at {folder}: set JAXRO_DATA to the folder that holds it")
+    return folder

@@ -1,0 +1,276 @@
+"""What every orientation must obey, whatever the numbers: symmetries, transformations of JAX, solvers, isolation."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import oracles
+import problems
+import pytest
+
+from jaxro import (
+    DependentElements,
+    IndependentElements,
+    RelativePose,
+    convert,
+    coplanarity,
+    orient_batch,
+    pad,
+    pair,
+    rotations,
+    stack,
+)
+from jaxro.pairs import swapped
+from jaxro.results import is_usable
+
+BASE = 70.0
+every_system = pytest.mark.parametrize("system", problems.SYSTEMS, ids=lambda s: s.__name__)
+every_residual = pytest.mark.parametrize(
+    "residual", (coplanarity.rigorous, coplanarity.parallax), ids=("rigorous", "parallax")
+)
+
+
+def oriented(measured, system=RelativePose, **keywords):
+    return problems.orient(measured, elements=system, base=keywords.pop("base", BASE), **keywords)
+
+
+def numbers(elements):
+    """All fields of the elements as one array (for RelativePose quaternion and base)."""
+    return np.array([np.asarray(leaf) for leaf in jax.tree.leaves(elements)])
+
+
+def close(first, second, atol):
+    """Every number of two orientations within atol of its size; results equal."""
+    for path, a in jax.tree.leaves_with_path(first):
+        b = dict(jax.tree.leaves_with_path(second))[path]
+        a, b = np.asarray(a), np.asarray(b)
+        name = jax.tree_util.keystr(path)
+        if name == ".iterations":
+            continue
+        np.testing.assert_allclose(a, b, rtol=atol, atol=atol * max(1.0, np.max(np.abs(b), initial=0.0)), err_msg=name)
+
+
+@every_residual
+@every_system
+def test_photo_swap(system, residual):
+    """Left and right exchanged: R' = Rᵀ, b' = -Rᵀ b, the corrections change places, the accuracy stays."""
+    measured = problems.tilted()
+    one = oriented(measured, residual=residual)
+    back = -BASE if system is DependentElements else BASE
+    two = oriented(swapped(measured), system, base=back, residual=residual)
+    two.check()
+    if residual is coplanarity.rigorous:
+        r, b = problems.rotation_base(one.pose)
+        inverse = RelativePose(*rotations.to_quaternion(rotations.as_matrix(jnp.asarray(r.T))), *jnp.asarray(-r.T @ b))
+        expected = convert(inverse, system, jnp.asarray(back))
+        np.testing.assert_allclose(numbers(two.elements), numbers(expected), atol=1e-9)
+        np.testing.assert_allclose(two.sigma0, one.sigma0, rtol=1e-9)
+        np.testing.assert_allclose(two.redundancy, one.redundancy, atol=1e-9)
+        np.testing.assert_allclose(np.stack(two.corrections), np.stack(one.corrections)[[2, 3, 0, 1]], atol=1e-9)
+    else:
+        # the frame parallel to the base is level with the left photo, so the parallaxes are others by its cross tilt
+        turn, shift = problems.difference(two.pose, *inverted(one.pose))
+        assert turn < 1e-4 and shift < 1e-4
+
+
+def inverted(pose):
+    r, b = problems.rotation_base(pose)
+    return r.T, -r.T @ b
+
+
+@every_system
+def test_scale(system):
+    """Coordinates and focal lengths in another unit: angles stay, lengths follow, redundancy numbers stay."""
+    measured = problems.tilted()
+    larger = pair(*(3.0 * c for c in measured.coordinates), focal=3.0 * measured.focal_left)
+    one, two = oriented(measured, system), oriented(larger, system, base=3.0 * BASE)
+    lengths = np.array([3.0 if not angle else 1.0 for angle in system.angles])
+    values = [np.array(o.elements.values()) for o in (one, two)]
+    np.testing.assert_allclose(values[1], values[0] * lengths, atol=1e-9)
+    np.testing.assert_allclose(two.deviations, one.deviations * lengths, rtol=1e-8)
+    np.testing.assert_allclose(two.sigma0, 3 * one.sigma0, rtol=1e-9)
+    np.testing.assert_allclose(two.redundancy, one.redundancy, atol=1e-9)
+    np.testing.assert_allclose(np.stack(two.corrections), 3 * np.stack(one.corrections), atol=1e-9)
+
+
+def bundle_turned(measured, turn):
+    """The pair with the bundle of rays of its left photo turned, as if the camera had been held otherwise."""
+    p = oracles.vectors(np.asarray(measured.x_left), np.asarray(measured.y_left), float(measured.focal_left)) @ turn.T
+    f = float(measured.focal_left)
+    x, y = -f * p[:, 0] / p[:, 2], -f * p[:, 1] / p[:, 2]
+    return pair(x, y, measured.x_right, measured.y_right, focal=measured.focal_left)
+
+
+@every_residual
+@every_system
+def test_model_rotation(system, residual):
+    """Errorless: the left bundle turned by Q gives R' = Q R, b' = Q b."""
+    turn = oracles.wolf(0.05, -0.1, 0.4)
+    measured = problems.tilted(sigma=0.0)
+    r, b = problems.rotation_base(oriented(measured, system, residual=residual).pose)
+    found = oriented(bundle_turned(measured, turn), system, residual=residual)
+    assert max(problems.difference(found.pose, turn @ r, turn @ b)) < 1e-9
+
+
+def test_turn_in_the_photo_plane():
+    """With errors: turned about the photo axis the accuracy of a coordinate is the same, so everything is."""
+    turn = oracles.r3(1.1)
+    measured = problems.tilted()
+    one, two = oriented(measured), oriented(bundle_turned(measured, turn))
+    r, b = problems.rotation_base(one.pose)
+    assert max(problems.difference(two.pose, turn @ r, turn @ b)) < 1e-9
+    np.testing.assert_allclose(two.sigma0, one.sigma0, rtol=1e-9)
+    np.testing.assert_allclose(two.redundancy, one.redundancy, atol=1e-9)
+
+
+@every_residual
+@every_system
+def test_point_order(system, residual):
+    measured = problems.tilted()
+    order = np.random.default_rng(0).permutation(16)
+    shuffled = pair(*(c[order] for c in measured.coordinates), focal=measured.focal_left)
+    one, two = (oriented(p, system, residual=residual) for p in (measured, shuffled))
+    np.testing.assert_allclose(numbers(two.elements), numbers(one.elements), atol=1e-10)
+    np.testing.assert_allclose(two.cofactor, one.cofactor, rtol=1e-7, atol=1e-14)
+    for name in ("parallax", "residuals", "redundancy"):
+        np.testing.assert_allclose(getattr(two, name), getattr(one, name)[order], atol=1e-9, err_msg=name)
+    for a, b in zip((*one.corrections, *one.model), (*two.corrections, *two.model), strict=True):
+        np.testing.assert_allclose(b, a[order], atol=1e-6)
+
+
+@every_residual
+@every_system
+def test_padding(system, residual):
+    measured = problems.tilted()
+    one, two = oriented(measured, system, residual=residual), oriented(pad(measured, 23), system, residual=residual)
+    np.testing.assert_allclose(numbers(two.elements), numbers(one.elements), atol=1e-11)
+    np.testing.assert_allclose(two.sigma0, one.sigma0, rtol=1e-9)
+    assert int(two.degrees_of_freedom) == 11 and bool(two.result == one.result)
+    for per_point in (two.parallax, two.residuals, two.redundancy, two.in_front, *two.corrections, *two.model):
+        assert per_point.shape == (23,) and not np.any(np.asarray(per_point)[16:])
+
+
+def test_masked_points_may_hold_anything():
+    measured = problems.tilted()
+    full = pad(measured, 18)
+    rubbish = eqx.tree_at(lambda p: (p.x_left, p.y_right), full, replace_fn=lambda c: c.at[16:].set(jnp.nan))
+    close(oriented(rubbish), oriented(full), 0.0)
+
+
+@every_residual
+@every_system
+def test_jit_is_eager(system, residual):
+    measured = problems.tilted()
+    compiled = eqx.filter_jit(lambda p: oriented(p, system, residual=residual))(measured)
+    close(compiled, oriented(measured, system, residual=residual), 1e-10)
+
+
+@every_residual
+@every_system
+def test_vmap_is_a_loop(system, residual):
+    pairs = [problems.tilted(seed=seed) for seed in range(4)]
+    together = eqx.filter_vmap(lambda p: oriented(p, system, residual=residual))(stack(pairs))
+    batch = orient_batch(stack(pairs), elements=system, base=BASE, residual=residual)
+    for i, measured in enumerate(pairs):
+        alone = oriented(measured, system, residual=residual)
+        close(jax.tree.map(lambda leaf, i=i: leaf[i], together), alone, 1e-9)
+        close(jax.tree.map(lambda leaf, i=i: leaf[i], batch), alone, 1e-9)
+
+
+@every_residual
+@every_system
+def test_three_derivatives_agree(system, residual):
+    """d elements / d measured coordinates: forward, reverse and finite differences, at residuals far from zero."""
+    measured = problems.tilted(sigma=0.1)
+
+    def values(coordinates):
+        found = oriented(pair(*coordinates, focal=70.0), system, residual=residual)
+        return jnp.stack(found.elements.values() if system is not RelativePose else jax.tree.leaves(found.elements))
+
+    x = jnp.stack(measured.coordinates)
+    forward, reverse = jax.jit(jax.jacfwd(values))(x), jax.jit(jax.jacrev(values))(x)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12 * np.max(np.abs(forward)))
+
+    for seed in range(3):
+        direction = jnp.asarray(np.random.default_rng(seed).normal(size=x.shape))
+        step = 2e-3
+        slope = [(values(x + h * direction) - values(x - h * direction)) / (2 * h) for h in (step, 2 * step)]
+        numeric = (4 * slope[0] - slope[1]) / 3
+        exact = jnp.tensordot(forward, direction, 2)
+        np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-6 * np.max(np.abs(exact)))
+
+
+SOLVERS = {
+    "Gauss-Newton": optx.GaussNewton(rtol=1e-12, atol=1e-12),
+    "Levenberg-Marquardt": optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12),
+    "dogleg": optx.Dogleg(rtol=1e-12, atol=1e-12),
+}
+
+
+@every_system
+@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+def test_solvers_of_optimistix_agree(solver, system):
+    measured = problems.tilted()
+    one, two = oriented(measured, system), oriented(measured, system, solver=solver, max_steps=200)
+    two.check()
+    scale = np.array([1.0 if angle else BASE for angle in system.angles]) if system is not RelativePose else 1.0
+    width = 5 if system is not RelativePose else 7
+    np.testing.assert_allclose((numbers(two.elements) - numbers(one.elements))[:width] / scale, 0.0, atol=1e-9)
+    np.testing.assert_allclose(two.sigma0, one.sigma0, rtol=1e-9)
+
+
+def spoiled(measured):
+    """Pairs that cannot be oriented, each padded like the good one."""
+    nothing = jnp.zeros_like(measured.x_left)
+    row = jnp.linspace(-60.0, 60.0, measured.x_left.shape[-1])
+    few = jnp.arange(measured.x_left.shape[-1]) < 4
+    f = measured.focal_left
+    return [
+        eqx.tree_at(lambda p: p.x_left, measured, measured.x_left.at[3].set(jnp.nan)),
+        eqx.tree_at(lambda p: p.focal_right, measured, jnp.asarray(jnp.inf)),
+        pair(nothing, nothing, nothing, nothing, focal=f),
+        pair(row, 0.5 * row, row - 70.0, 0.5 * row, focal=f),
+        pair(measured.x_left, measured.y_left, measured.x_left, measured.y_left, focal=f),
+        measured.with_mask(few),
+        pair(*(1e6 * c[::-1] if i == 1 else c for i, c in enumerate(measured.coordinates)), focal=f),
+    ]
+
+
+@every_system
+def test_failures_leave_their_neighbours_alone(system):
+    """Bit for bit: in a batch, good pairs come out the same whatever the others are."""
+    good = [problems.tilted(seed=seed) for seed in range(14)]
+    mixed = list(good)
+    mixed[::2] = spoiled(good[0])
+    clean, spoilt = (orient_batch(stack(b), elements=system, base=BASE) for b in (good, mixed))
+    assert not np.any(is_usable(spoilt.result)[::2])
+    for a, b in zip(jax.tree.leaves(clean), jax.tree.leaves(spoilt), strict=True):
+        np.testing.assert_array_equal(np.asarray(a)[1::2], np.asarray(b)[1::2])
+
+
+def test_failures_leave_their_neighbours_gradients_alone():
+    good = [problems.tilted(seed=seed) for seed in range(14)]
+    mixed = list(good)
+    mixed[::2] = spoiled(good[0])
+
+    @jax.jit
+    def gradient(batch):
+        def total(coordinates):
+            measured = eqx.tree_at(lambda p: p.coordinates, batch, coordinates)
+            found = eqx.filter_vmap(lambda p: oriented(p))(measured)
+            return jnp.sum(jnp.where(jnp.arange(14) % 2 == 1, found.elements.qx + found.elements.by, 0.0))
+
+        return jnp.stack(jax.grad(total)(batch.coordinates))
+
+    clean, spoilt = gradient(stack(good)), gradient(stack(mixed))
+    assert np.all(np.isfinite(spoilt[:, 1::2])) and np.any(clean[:, 1::2])
+    np.testing.assert_array_equal(clean[:, 1::2], spoilt[:, 1::2])
+
+
+def test_vertical_start_is_enough_for_vertical_photos():
+    """Independent elements start from zero and end where the general start ends."""
+    measured = problems.tilted()
+    zero = IndependentElements(*(jnp.zeros(()),) * 5)
+    one, two = oriented(measured, IndependentElements), oriented(measured, IndependentElements, start=zero)
+    np.testing.assert_allclose(numbers(two.elements), numbers(one.elements), atol=1e-9)
