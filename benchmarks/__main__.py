@@ -33,8 +33,9 @@ def main() -> int:
 
     measured = []
     for name in options.only or SUITES:
-        print(f"{name} ...", file=sys.stderr, flush=True)
-        measured += SUITES[name](QUICK if options.quick else Size())
+        found = SUITES[name](QUICK if options.quick else Size())
+        print(name, *(metric.row() for metric in found), sep="\n", file=sys.stderr, flush=True)  # a run takes minutes
+        measured += found
     print(f"{machine()}\n\n{contract.table(measured)}")
 
     worse = []

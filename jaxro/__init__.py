@@ -12,6 +12,7 @@ if "JAX_ENABLE_X64" not in _os.environ:
 
 from . import coplanarity as coplanarity, losses as losses, rotations as rotations, starts as starts
 from .adjustment import Adjustment as Adjustment, adjust as adjust
+from .batch import orient_batch as orient_batch
 from .elements import (
     AbstractElements as AbstractElements,
     DependentElements as DependentElements,

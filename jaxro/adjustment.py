@@ -68,8 +68,8 @@ def dimension(parameters: Parameters) -> int:
     return sum(jnp.size(leaf) for leaf in jax.tree.leaves(parameters))
 
 
-def whitened(condition: Callable, parameters: Parameters, observation: PyTree, cofactor: PyTree, use: Bool[Array, ""]):
-    """L⁻¹ g of one group, L Lᵀ = B Q Bᵀ; zero where the group is not used.
+def whitened(condition: Callable, parameters: Parameters, observation: PyTree, cofactor: PyTree, use) -> list:
+    """The m entries of L⁻¹ g of one group, L Lᵀ = B Q Bᵀ; zero where the group is not used.
 
     Entries of the observation whose cofactor is None are free of error.
     """
@@ -91,7 +91,7 @@ def whitened(condition: Callable, parameters: Parameters, observation: PyTree, c
     for i in range(len(g)):  # a masked group must not divide by its own zero
         weight[i][i] = jnp.where(use, weight[i][i], one)
     if len(g) == 1:
-        return jnp.where(use, g[0] * jax.lax.rsqrt(weight[0][0]), zero)
+        return [jnp.where(use, g[0] * jax.lax.rsqrt(weight[0][0]), zero)]
     factor, _ = normal.cholesky(weight)
     out: list = []
     for i, row in enumerate(factor):
@@ -99,19 +99,64 @@ def whitened(condition: Callable, parameters: Parameters, observation: PyTree, c
         for k in range(i):
             s = s - row[k] * out[k]
         out.append(jnp.where(use, s * row[i], zero))
-    return jnp.stack(out)
+    return out
 
 
-def residual_function(
-    condition: Callable, observations: PyTree, cofactor: PyTree, mask: Bool[Array, " group"]
-) -> Callable:
-    """parameters -> whitened residuals of all groups."""
+class Residuals(eqx.Module):
+    """The whitened residuals of all groups as a function of a displacement x of the parameters from `centre`.
 
-    def residuals(parameters):
-        one = lambda observation, q, use: whitened(condition, parameters, observation, q, use)
-        return jax.vmap(one)(observations, cofactor, mask)
+    What the groups share is computed once by `prepare(parameters)`; its few numbers θ are what a group's condition
+    sees. A column of the Jacobian is then Σ_m (dr/dθ_m) (dθ_m/dx_k): the first factor by reverse mode for each group,
+    the second once for all of them.
+    """
 
-    return residuals
+    prepare: Callable | None
+    condition: Callable
+    centre: Parameters
+    observations: PyTree
+    cofactor: PyTree
+    mask: Bool[Array, " group"]
+    loss: AbstractLoss | None = None
+
+    def shared(self, *x: Array) -> tuple[Array, ...]:
+        """θ(x), as a flat tuple of numbers; x itself where there is no `prepare`."""
+        if self.prepare is None:
+            return x
+        return tuple(jax.tree.leaves(self.prepare(moved(self.centre, x))))
+
+    def group(self, theta: tuple[Array, ...], observation: PyTree, cofactor: PyTree, use) -> list:
+        """The m whitened (and, with a loss, transformed) residuals of one group."""
+        if self.prepare is None:
+            prepared = moved(self.centre, theta)
+        else:
+            prepared = jax.tree.unflatten(jax.tree.structure(jax.eval_shape(self.prepare, self.centre)), theta)
+        r = whitened(self.condition, prepared, observation, cofactor, use)
+        return r if self.loss is None else [self.loss.transformed(entry) for entry in r]
+
+    def __call__(self, x: tuple[Array, ...]) -> Float[Array, " group"] | Float[Array, "group m"]:
+        theta = self.shared(*x)
+        each = jax.vmap(lambda *one: self.group(theta, *one))
+        r = each(self.observations, self.cofactor, self.mask)
+        return r[0] if len(r) == 1 else jnp.stack(r, axis=1)
+
+    def columns(self, x: tuple[Array, ...]) -> tuple[list[Array], list[list[Array]]]:
+        """The m residual arrays, and for each parameter the m arrays of its column."""
+        theta = self.shared(*x)
+
+        def one(*group):
+            r, pull = jax.vjp(lambda theta: self.group(theta, *group), theta)
+            unit = lambda c: [jnp.ones_like(entry) if k == c else jnp.zeros_like(entry) for k, entry in enumerate(r)]
+            return r, [pull(unit(c))[0] for c in range(len(r))]
+
+        r, gradients = jax.vmap(one)(self.observations, self.cofactor, self.mask)
+        if self.prepare is None:
+            return r, [[gradient[k] for gradient in gradients] for k in range(len(x))]
+        jacobian = []
+        for k in range(len(x)):  # one parameter at a time: what it does not touch stays a symbolic zero
+            along = lambda t, k=k: self.shared(*x[:k], t, *x[k + 1 :])
+            _, slope = jax.jvp(along, (x[k],), (jnp.ones_like(x[k]),))
+            jacobian.append([sum(d * s for d, s in zip(g, slope, strict=True)) for g in gradients])
+        return r, jacobian
 
 
 def adjust(
@@ -121,6 +166,7 @@ def adjust(
     cofactor: PyTree,
     mask: Bool[Array, " group"] | None = None,
     *,
+    prepare: Callable | None = None,
     loss: AbstractLoss | None = None,
     solver: optx.AbstractLeastSquaresSolver | None = None,
     max_steps: int = 30,
@@ -130,6 +176,7 @@ def adjust(
     `condition(parameters, observation)` of one group returns a number or m of them. `observations`: a pytree whose
     leaves have the groups on the first axis; `cofactor`: the same tree of variances (relative to sigma0²), numbers or
     one per group, None for what is free of error. `mask` selects groups. `start`: elements, or any pytree of numbers.
+    `prepare`: what all groups share, computed once; the condition then gets prepare(parameters) for the parameters.
     `solver`: any optimistix least-squares solver; `GaussNewton()` if None.
 
     With a loss, normal matrix and redundancy carry the final weights rho'(r²), and sigma0² = Σ w r² / (n - p): the
@@ -145,21 +192,15 @@ def adjust(
         observations,
         is_leaf=lambda q: q is None,
     )
-    residuals = residual_function(condition, observations, cofactor, mask)
     start = jax.lax.stop_gradient(start)
+    residuals = residuals_of(condition, prepare, start, observations, cofactor, mask, loss)
     p = dimension(start)
-    dtype = jax.tree.leaves(start)[0].dtype
-    origin = tuple(jnp.zeros((), dtype) for _ in range(p))
-
-    def objective(x, residuals):
-        r = residuals(moved(start, x))
-        return r if loss is None else loss.transformed(r)
-
+    origin = tuple(jnp.zeros((), jax.tree.leaves(start)[0].dtype) for _ in range(p))
     solution = optx.least_squares(
-        objective,
+        lambda x, residuals: residuals(x),
         normal.GaussNewton() if solver is None else solver,
         origin,
-        args=eqx.filter_closure_convert(residuals, start),
+        args=residuals,
         max_steps=max_steps,
         adjoint=optx.ImplicitAdjoint(linear_solver=normal.SmallCholesky()),
         throw=False,
@@ -168,22 +209,37 @@ def adjust(
     if isinstance(parameters, AbstractElements):
         parameters = parameters.normalised()
     converged = solution.result == optx.RESULTS.successful
-    return read(residuals, parameters, mask, loss, solution.stats["num_steps"], converged)
+    at_solution = eqx.tree_at(lambda r: (r.centre, r.loss), residuals, (parameters, None), is_leaf=lambda leaf: leaf is None)
+    return read(at_solution, loss, solution.stats["num_steps"], converged)
 
 
-def read(residuals: Callable, parameters: Parameters, mask, loss, iterations, converged) -> Adjustment:
-    """Everything that follows from the linearisation at the solution."""
-    p = dimension(parameters)
-    shape = jax.eval_shape(residuals, parameters).shape
-    zero = jnp.zeros((), jax.tree.leaves(parameters)[0].dtype)
-    r, jacobian = normal.columns(lambda x: residuals(moved(parameters, x)), [zero] * p)
-    weight = None if loss is None else loss.weight(r * r)
+def residuals_of(condition, prepare, centre, observations, cofactor, mask, loss=None) -> Residuals:
+    """`Residuals` whose functions carry what they close over as arguments, so that it can be differentiated."""
+    if prepare is not None:
+        prepare = eqx.filter_closure_convert(prepare, centre)
+        prepared = jax.eval_shape(prepare, centre)
+    else:
+        prepared = centre
+    first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), observations)
+    condition = eqx.filter_closure_convert(condition, prepared, first)
+    return Residuals(prepare, condition, centre, observations, cofactor, mask, loss)
+
+
+def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged) -> Adjustment:
+    """Everything that follows from the linearisation at the solution, the centre of `residuals`."""
+    p = dimension(residuals.centre)
+    zero = jnp.zeros((), jax.tree.leaves(residuals.centre)[0].dtype)
+    r, jacobian = residuals.columns((zero,) * p)
+    weight = None if loss is None else [loss.weight(entry * entry) for entry in r]
     n, _, squares = normal.accumulate(r, jacobian, weight)
     q, pivot = normal.inverse(n)
-    leverage = sum((1.0 if i == j else 2.0) * q[i][j] * jacobian[i] * jacobian[j] for i in range(p) for j in range(i + 1))
-    used = jnp.broadcast_to(jnp.expand_dims(mask, tuple(range(1, len(shape)))), shape).reshape(-1)
-    redundancy = jnp.where(used, 1 - (leverage if weight is None else weight * leverage), 0.0)
-    freedom = jnp.sum(used) - p
+    redundancy = []
+    for c in range(len(r)):
+        column = [jacobian[k][c] for k in range(p)]
+        taken = sum((1.0 if i == j else 2.0) * q[i][j] * column[i] * column[j] for i in range(p) for j in range(i + 1))
+        redundancy.append(jnp.where(residuals.mask, 1 - (taken if weight is None else weight[c] * taken), 0.0))
+    together = lambda a: a[0] if len(a) == 1 else jnp.stack(a, axis=1)
+    freedom = len(r) * jnp.sum(residuals.mask) - p
     checked = freedom > 0
     variance = squares / jnp.where(checked, freedom, 1).astype(squares.dtype)
     positive = variance > 0
@@ -191,11 +247,11 @@ def read(residuals: Callable, parameters: Parameters, mask, loss, iterations, co
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)
     result = RESULTS.where(pivot < normal.SINGULAR, RESULTS.rank_deficient, result)
     return Adjustment(
-        parameters,
+        residuals.centre,
         normal.dense(n),
         normal.dense(q),
-        r.reshape(shape),
-        redundancy.reshape(shape),
+        together(r),
+        together(redundancy),
         jnp.where(checked, root, jnp.nan),
         pivot,
         freedom,

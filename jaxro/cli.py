@@ -7,7 +7,10 @@ import enum
 from pathlib import Path
 from typing import Annotated
 
-import typer
+try:
+    import typer
+except ModuleNotFoundError:
+    raise SystemExit("The command line needs typer and rich: pip install 'jaxro[cli]'") from None
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, rich_markup_mode=None)
 
@@ -39,27 +42,35 @@ def orient(
         typer.Argument(
             help="CSV table with the columns point,x_left,y_left,x_right,y_right (or id,xl,yl,xr,yr) and optionally "
             "pair, sigma. Without it the embedded example is oriented.",
+            metavar="FILE.csv",
             show_default=False,
         ),
     ] = None,
     camera: Annotated[
         Path | None,
         typer.Option(
-            help="TOML file: [camera], or [left] and [right], or [photo.NAME] for pairs named LEFT-RIGHT or LEFT_RIGHT; "
+            help="[camera], or [left] and [right], or [photo.NAME] for pairs named LEFT-RIGHT or LEFT_RIGHT; "
             "keys focal, principal_point, pixel_size, y_down.",
+            metavar="FILE.toml",
             show_default=False,
         ),
     ] = None,
     focal: Annotated[
-        float | None, typer.Option(help="Focal length in photo units, of both photos.", show_default=False)
+        float | None, typer.Option(help="Focal length in photo units, of both photos.", metavar="F", show_default=False)
     ] = None,
     principal_point: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Principal point x y, in the units of the table.  [default: 0 0]", show_default=False),
+        typer.Option(
+            help="Principal point x y, in the units of the table.  [default: 0 0]", metavar="X Y", show_default=False
+        ),
     ] = None,
     pixel_size: Annotated[
         float | None,
-        typer.Option(help="Photo units per unit of the table, e.g. mm per pixel.  [default: 1]", show_default=False),
+        typer.Option(
+            help="Photo units per unit of the table, e.g. mm per pixel.  [default: 1]",
+            metavar="SIZE",
+            show_default=False,
+        ),
     ] = None,
     y_down: Annotated[bool, typer.Option("--y-down", help="y of the table counts downwards.")] = False,
     sigma: Annotated[
@@ -67,6 +78,7 @@ def orient(
         typer.Option(
             help="Standard deviation of every coordinate before the adjustment, in the units of the table; "
             "sigma0 is then a ratio to it.",
+            metavar="SD",
             show_default=False,
         ),
     ] = None,
@@ -83,16 +95,19 @@ def orient(
         typer.Option(
             help="bx of the dependent, b of the independent system: the scale of the model.  "
             "[default: mean x-parallax]",
+            metavar="B",
             show_default=False,
         ),
     ] = None,
     residual: Annotated[
         Residual, typer.Option(help="What is minimised: whitened conditions, or strict y-parallaxes.")
     ] = Residual.rigorous,
-    unit: Annotated[str, typer.Option(help="Name of the photo unit in reports: mm, px.")] = "mm",
+    unit: Annotated[str, typer.Option(help="Name of the photo unit in reports: mm, px.", metavar="NAME")] = "mm",
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for elements.csv, residuals.csv, points.csv, summary.json.", show_default=False),
+        typer.Option(
+            help="Folder for elements.csv, residuals.csv, points.csv, summary.json.", metavar="DIR", show_default=False
+        ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the files in a folder that is not empty.")] = False,
 ) -> None:

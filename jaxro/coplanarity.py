@@ -30,8 +30,10 @@ Point = tuple[Scalar, Scalar, Scalar, Scalar]
 
 
 class Adjusted(NamedTuple):
-    """What `adjust` needs: condition(elements, observation) for one point, observations and cofactors of all points."""
+    """What `adjust` needs: prepare(elements) once for the pair, condition(prepared, observation) of one point, and the
+    observations and cofactors of all points."""
 
+    prepare: Callable
     condition: Callable
     observations: tuple
     cofactor: tuple
@@ -69,32 +71,37 @@ def turned(elements: AbstractElements) -> tuple[Matrix, Matrix]:
     return left, rot.product(left, rotation)
 
 
-def y_parallax(frames: tuple[Matrix, Matrix], point: Point, focal_left: Scalar, focal_right: Scalar) -> Scalar:
-    """q = y1* - y2* = -f1 (Y1/Z1 - Y2/Z2) of one point, the photos turned parallel to the base by `turned`."""
+def y_parallax(rows: tuple, point: Point, focal_left: Scalar, focal_right: Scalar) -> Scalar:
+    """q = y1* - y2* = -f1 (Y1/Z1 - Y2/Z2) of one point; `rows` are the Y and Z rows of the two rotations `turned`."""
     x1, y1, x2, y2 = point
-    left, right = frames
-    first = rot.apply(left, (x1, y1, -focal_left))
-    second = rot.apply(right, (x2, y2, -focal_right))
-    return -focal_left * (first[1] / first[2] - second[1] / second[2])
+    first, second = (x1, y1, -focal_left), (x2, y2, -focal_right)
+    left, right = rows
+    return -focal_left * (
+        rot.dot(left[0], first) / rot.dot(left[1], first) - rot.dot(right[0], second) / rot.dot(right[1], second)
+    )
 
 
 def rigorous(pair: Pair) -> Adjusted:
     """Adjust the four image coordinates of every point."""
-
-    def of_point(elements: AbstractElements, point: Point) -> Scalar:
-        return condition(fundamental_matrix(elements, pair.focal_left, pair.focal_right), point)
-
-    return Adjusted(of_point, pair.coordinates, (pair.sigma**2,) * 4)
+    prepare = lambda elements: fundamental_matrix(elements, pair.focal_left, pair.focal_right)
+    return Adjusted(prepare, condition, pair.coordinates, (pair.sigma**2,) * 4)
 
 
 def parallax(pair: Pair) -> Adjusted:
     """Adjust the y-parallax of every point as if it had been measured; the coordinates are taken as free of error."""
 
-    def of_point(elements: AbstractElements, observation: tuple[Point, Scalar]) -> Scalar:
-        point, measured = observation
-        return y_parallax(turned(elements), point, pair.focal_left, pair.focal_right) - measured
+    def prepare(elements: AbstractElements):
+        left, right = turned(elements)
+        return left[1:], right[1:], pair.focal_left, pair.focal_right
 
-    return Adjusted(of_point, (pair.coordinates, jnp.zeros_like(pair.sigma)), ((None,) * 4, pair.sigma**2))
+    def of_point(prepared: tuple, observation: tuple[Point, Scalar]) -> Scalar:
+        left, right, *focals = prepared
+        point, measured = observation
+        return y_parallax((left, right), point, *focals) - measured
+
+    return Adjusted(
+        prepare, of_point, (pair.coordinates, jnp.zeros_like(pair.sigma)), ((None,) * 4, pair.sigma**2)
+    )
 
 
 def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
 Scalars = Sequence[Scalar]
+Columns = Sequence[Float[Array, " residual"]]
 Lower = list[list[Scalar]]
 """Lower triangle of a symmetric matrix: row i has i + 1 entries."""
 
@@ -42,22 +43,26 @@ def _sums_jvp(primals, tangents):
     return sums(arrays), tuple(jnp.sum(a) for a in moved)
 
 
-def columns(residual: Callable, x: Scalars) -> tuple[Float[Array, " residual"], list[Float[Array, " residual"]]]:
-    """Residuals r(x) and the columns dr/dx_k, by linearising once and pushing each unit vector forward."""
-    r, push = jax.linearize(lambda *y: residual(y).reshape(-1), *x)
-    unit = jnp.eye(len(x), dtype=r.dtype)
-    return r, [push(*(unit[k, i] for i in range(len(x)))) for k in range(len(x))]
-
-
-def accumulate(r: Array, jacobian: Sequence[Array], weight: Array | None = None) -> tuple[Lower, list[Scalar], Scalar]:
-    """N = JᵀWJ, h = JᵀWr and rᵀWr."""
-    weighted = [*jacobian, r] if weight is None else [weight * column for column in (*jacobian, r)]
+def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None):
+    """N = JᵀWJ, h = JᵀWr and rᵀWr, from residuals and columns that may come in several arrays each."""
     p = len(jacobian)
-    products = [weighted[i] * jacobian[j] for i in range(p) for j in range(i + 1)]
-    products += [weighted[p] * column for column in jacobian] + [weighted[p] * r]
-    total = list(sums(tuple(products)))
+    parts = []
+    for c, residual in enumerate(r):
+        column = [jacobian[k][c] for k in range(p)]
+        weighted = [*column, residual] if weight is None else [weight[c] * a for a in (*column, residual)]
+        products = [weighted[i] * column[j] for i in range(p) for j in range(i + 1)]
+        products += [weighted[p] * a for a in column] + [weighted[p] * residual]
+        parts.append(sums(tuple(products)))
+    total = [sum(part[1:], part[0]) for part in zip(*parts, strict=True)]
     n = [[total.pop(0) for _ in range(i + 1)] for i in range(p)]
     return n, total[:p], total[p]
+
+
+def columns(residual: Callable, x: Scalars) -> tuple[Columns, list[Columns]]:
+    """Residuals r(x) and the columns dr/dx_k of any residual function, by linearising it once."""
+    r, push = jax.linearize(lambda *y: residual(y), *x)
+    unit = jnp.eye(len(x), dtype=r.dtype)
+    return [r], [[push(*(unit[k, i] for i in range(len(x))))] for k in range(len(x))]
 
 
 def cholesky(n: Lower) -> tuple[Lower, Scalar]:
@@ -130,7 +135,8 @@ def inverse(n: Lower) -> tuple[Lower, Scalar]:
 class GaussNewton(optx.AbstractLeastSquaresSolver):
     """Gauss-Newton for a few parameters; its loop carries the parameters and two step sizes, nothing else.
 
-    Ends when the *next* step, predicted from the last two, is below atol + rtol |x|. `max_step` bounds the largest
+    `args` that know their own residuals and columns (`adjustment.Residuals`) are asked for them; any other residual
+    function is linearised. Ends when the *next* step, predicted from the last two, is below atol + rtol |x|. `max_step` bounds the largest
     component of a step (0.5 rad for orientations, where a longer one leaves the range of the linearisation).
     """
 
@@ -145,8 +151,10 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
 
     def step(self, fn, y, args, options, state, tags):
         leaves, structure = jax.tree.flatten(y)
-        residual = lambda x: ravel_pytree(fn(jax.tree.unflatten(structure, list(x)), args)[0])[0]
-        r, jacobian = columns(residual, leaves)
+        if hasattr(args, "columns"):
+            r, jacobian = args.columns(tuple(leaves))
+        else:
+            r, jacobian = columns(lambda x: ravel_pytree(fn(jax.tree.unflatten(structure, x), args)[0])[0], leaves)
         n, h, _ = accumulate(r, jacobian)
         delta = solve(n, h)
         longest = delta[0] * 0
@@ -190,11 +198,11 @@ class SmallCholesky(lx.AbstractLinearSolver):
         return True
 
 
-def steps(residual: Callable, x: tuple[Scalar, ...], count: int, max_step: float) -> tuple[Scalar, ...]:
-    """A fixed number of Gauss-Newton steps, for starts that need no convergence test."""
+def steps(residuals: Any, x: tuple[Scalar, ...], count: int, max_step: float) -> tuple[Scalar, ...]:
+    """A fixed number of Gauss-Newton steps on `adjustment.Residuals`, for starts that need no convergence test."""
     solver = GaussNewton(max_step=max_step)
 
     def body(_, x):
-        return solver.step(lambda y, _: (residual(y), None), x, None, {}, (x[0], x[0]), frozenset())[0]
+        return solver.step(None, x, residuals, {}, (x[0], x[0]), frozenset())[0]
 
     return lax.fori_loop(0, count, body, x)

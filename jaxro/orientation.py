@@ -14,7 +14,8 @@ from .adjustment import adjust
 from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
 from .losses import AbstractLoss
 from .normal_equations import GaussNewton
-from .pairs import Pair, cleaned
+from .pairs import Coordinates, Pair, cleaned
+from .programs import Program, traced
 from .results import RESULTS, is_usable
 
 WEAK = 0.2
@@ -45,9 +46,9 @@ class Orientation(eqx.Module):
     cofactor: Float[Array, "5 5"]
     parallax: Float[Array, " point"]
     residuals: Float[Array, " point"]
-    corrections: coplanarity.Point
+    corrections: Coordinates
     redundancy: Float[Array, " point"]
-    model: rot.Vector
+    model: tuple[Float[Array, " point"], Float[Array, " point"], Float[Array, " point"]]
     in_front: Bool[Array, " point"]
     m_q: Float[Array, ""]
     sigma0: Float[Array, ""]
@@ -102,28 +103,56 @@ def orient(
             f"orient takes one pair, but the coordinates have shape {pair.x_left.shape}: "
             "use jax.vmap(orient), or orient_batch"
         )
+    base = None if base is None else jnp.asarray(base, pair.x_left.dtype)
+    options = dict(elements=elements, base=base, residual=residual, loss=loss, solver=solver, max_steps=max_steps)
+    if traced((pair, base, start)):
+        return _orient(pair, start=start, **options)
+    if not isinstance(start, starts.Auto):
+        return Program(_orient, options | {"start": start})(pair)
+    # Two small programs instead of one large: the general start is compiled when a pair first needs it.
+    orientation, fits = Program(orient_near, options | {"start": start})(pair)
+    if bool(fits):
+        return orientation
+    return Program(_orient, options | {"start": start.general})(pair)
+
+
+NEAR_STEPS = 10
+"""Steps allowed from the vertical: near-vertical photos take four or five."""
+
+
+def orient_near(pair: Pair, *, start: starts.Auto, max_steps: int = 30, **options) -> tuple[Orientation, Array]:
+    """The first part of an `Auto` start as an orientation of its own: from the vertical, and whether that fits."""
+    near = orient(pair, start=starts.Vertical(), max_steps=min(max_steps, NEAR_STEPS), **options)
+    return near, start.fits(cleaned(pair)[0], near.pose) & (near.result != RESULTS.diverged)
+
+
+def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_steps) -> Orientation:
     pair, bad_input = cleaned(pair)
     begin = starts.Begin(start, False) if isinstance(start, AbstractElements) else start(pair)
-    condition, observations, cofactor = residual(pair)
+    prepare, condition, observations, cofactor = residual(pair)
     adjustment = adjust(
         condition,
         begin.pose,
         observations,
         cofactor,
         pair.mask,
+        prepare=prepare,
         loss=loss,
         solver=GaussNewton(max_step=0.5) if solver is None else solver,
         max_steps=max_steps,
     )
     solved = adjustment.parameters
     pose, flipped = _facing(to_pose(solved), pair, isinstance(solved, RelativePose))
+    # The barriers keep XLA from expanding these few numbers again into every result that uses them.
+    pose, flipped, solved = lax.optimization_barrier((pose, flipped, solved))
     length = _length(pair, elements, base, pose)
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
     f = coplanarity.fundamental_matrix(pose, pair.focal_left, pair.focal_right)
+    frames = tuple(frame[1:] for frame in coplanarity.turned(pose))
+    f, frames, chosen, q = lax.optimization_barrier((f, frames, chosen, q))
     each = lambda function: jax.vmap(function)(pair.coordinates, pair.mask)
     v = each(lambda point, use: coplanarity.corrections(f, point, use))
-    frames = coplanarity.turned(pose)
     parallax = each(
         lambda point, use: jnp.where(
             use, coplanarity.y_parallax(frames, point, pair.focal_left, pair.focal_right), 0.0

@@ -17,6 +17,10 @@ Coordinates = tuple[Float[Array, "*pairs point"], ...]
 """x_left, y_left, x_right, y_right"""
 
 
+Values = ArrayLike | Sequence
+"""Anything that makes an array"""
+
+
 class Camera(eqx.Module):
     """From measured image coordinates to photo coordinates; used at the edge, never inside the engine.
 
@@ -76,15 +80,15 @@ class Pair(eqx.Module):
 
 
 def pair(
-    x_left: ArrayLike,
-    y_left: ArrayLike,
-    x_right: ArrayLike,
-    y_right: ArrayLike,
+    x_left: Values,
+    y_left: Values,
+    x_right: Values,
+    y_right: Values,
     *,
     focal: ArrayLike | tuple[ArrayLike, ArrayLike],
-    sigma: ArrayLike | None = None,
-    weight: ArrayLike | None = None,
-    mask: ArrayLike | None = None,
+    sigma: Values | None = None,
+    weight: Values | None = None,
+    mask: Values | None = None,
 ) -> Pair:
     """A `Pair` from four equally long coordinate arrays (leading batch axes allowed).
 

@@ -3,10 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
+import problems
 import pytest
 
-from jaxro import RESULTS, orient_batch, simulation
-from jaxro.results import is_usable
+from jaxro import RESULTS, is_usable, orient_batch, pair, simulation, swapped
 
 
 def errors_of_poses(found, true):
@@ -39,3 +40,60 @@ def test_random_pairs_in_any_position():
 @pytest.mark.slow
 def test_ten_thousand_random_pairs():
     check_random_pairs(10_000, seed=7)
+
+
+@pytest.fixture(scope="module")
+def hundred():
+    """Pairs with small errors, and their orientations."""
+    pairs, _ = simulation.random_pairs(jax.random.key(3), 100, 12)
+    keys = jax.random.split(jax.random.key(4), 100)
+    pairs = jax.vmap(simulation.noisy, in_axes=(0, 0, None))(pairs, keys, 1e-3)
+    return pairs, orient_batch(pairs)
+
+
+def differences(found, expected):
+    """Largest angle between found poses and expected (R, b), over the pairs both calls are sure of."""
+    pairs = [jax.tree.map(lambda leaf, i=i: leaf[i], found.pose) for i in range(len(expected))]
+    return np.array([max(problems.difference(pose, *e)) for pose, e in zip(pairs, expected, strict=True)])
+
+
+def poses(found):
+    """(R, b) of every pair."""
+    singles = [jax.tree.map(lambda leaf, i=i: leaf[i], found.pose) for i in range(found.sigma0.shape[0])]
+    return [problems.rotation_base(pose) for pose in singles]
+
+
+def sure(*found):
+    return np.all([np.asarray(f.result == RESULTS.successful) for f in found], axis=0)
+
+
+def test_most_pairs_with_errors_are_oriented(hundred):
+    assert np.mean(sure(hundred[1])) > 0.95
+
+
+def test_photo_swap_in_any_position(hundred):
+    pairs, one = hundred
+    two = orient_batch(swapped(pairs))
+    expected = [(r.T, -r.T @ b) for r, b in poses(one)]
+    both = sure(one, two)
+    assert np.mean(both) > 0.9 and np.max(differences(two, expected)[both]) < 1e-7
+
+
+def test_point_order_in_any_position(hundred):
+    pairs, one = hundred
+    two = orient_batch(jax.tree.map(lambda field: field[..., ::-1] if field.ndim == 2 else field, pairs))
+    both = sure(one, two)
+    assert np.mean(both) > 0.9 and np.max(differences(two, poses(one))[both]) < 1e-7
+    np.testing.assert_allclose(two.redundancy[both][:, ::-1], one.redundancy[both], atol=1e-6)
+
+
+def test_turn_about_the_photo_axis_in_any_position(hundred):
+    """Left photo turned in its plane by 2.5 rad: R' = Q R, b' = Q b."""
+    pairs, one = hundred
+    turn = oracles.r3(2.5)
+    x = turn[0, 0] * pairs.x_left + turn[0, 1] * pairs.y_left
+    y = turn[1, 0] * pairs.x_left + turn[1, 1] * pairs.y_left
+    two = orient_batch(pair(x, y, pairs.x_right, pairs.y_right, focal=pairs.focal_left))
+    both = sure(one, two)
+    assert np.mean(both) > 0.9
+    assert np.max(differences(two, [(turn @ r, turn @ b) for r, b in poses(one)])[both]) < 1e-7

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..pairs import Camera, Pair
@@ -61,7 +62,8 @@ def read(path: Path) -> Cameras:
         one = _camera(path, text, "camera", tables["camera"])
         return Cameras(str(path), one, one)
     if names == {"left", "right"}:
-        return Cameras(str(path), *(_camera(path, text, side, tables[side]) for side in ("left", "right")))
+        left, right = (_camera(path, text, side, tables[side]) for side in ("left", "right"))
+        return Cameras(str(path), left, right)
     found = f"the entries {', '.join(tables)}" if tables else "no entries"
     raise TableError(path, None, None, found, FORMS)
 
@@ -74,21 +76,29 @@ def _camera(path: Path, text: str, table: str, entries: Any) -> Camera:
         line, place = _line(text, table, key), f"{table}.{key}"
         if key not in KEYS:
             raise TableError(path, line, place, "an unknown key", f"{', '.join(KEYS)}; none is ignored")
-        numbers = value if key == "principal_point" else [value]
-        if key == "y_down":
-            good, expected = isinstance(value, bool), "true or false"
-        elif key == "principal_point":
-            good, expected = isinstance(value, list) and len(value) == 2, "two numbers [x, y] in measured units"
-        else:
-            good, expected = True, "a positive number"
-        if key != "y_down":
-            good = good and all(type(n) in (int, float) and np.isfinite(n) for n in numbers)
-            good = good and (key == "principal_point" or value > 0)
+        good, expected = _fits(key, value)
         if not good:
             raise TableError(path, line, place, repr(value), expected)
     if "focal" not in entries:
         raise TableError(path, _line(text, table), f"{table}.focal", "no such key", "the focal length in photo units")
-    return Camera(**{k: tuple(v) if k == "principal_point" else v for k, v in entries.items()})
+    x0, y0 = entries.get("principal_point", (0, 0))
+    return Camera(
+        float(entries["focal"]),
+        (float(x0), float(y0)),
+        float(entries.get("pixel_size", 1)),
+        entries.get("y_down", False),
+    )
+
+
+def _fits(key: str, value: Any) -> tuple[bool, str]:
+    """Whether a value suits its key, and what would."""
+    number = lambda v: type(v) in (int, float) and np.isfinite(v)
+    if key == "y_down":
+        return isinstance(value, bool), "true or false"
+    if key == "principal_point":
+        good = isinstance(value, list) and len(value) == 2 and all(map(number, value))
+        return good, "two numbers [x, y] in measured units"
+    return bool(number(value) and value > 0), "a positive number"
 
 
 def _line(text: str, table: str, key: str | None = None) -> int | None:
@@ -106,25 +116,23 @@ def _line(text: str, table: str, key: str | None = None) -> int | None:
 
 
 def to_pair(measured: Measurements, file: str, left: Camera, right: Camera, sigma: float | None = None) -> Pair:
-    """Measured coordinates as a `Pair` of NumPy arrays in photo coordinates; sigma for all points or from the table.
+    """Measured coordinates as a `Pair` in photo coordinates; sigma for all points or from the table.
 
-    The arithmetic is that of `Camera.to_photo`; NumPy, because tables have pairs of every length and each length would
-    be compiled anew. Raises TableError where one sigma cannot serve two pixel sizes.
+    The arithmetic is that of `Camera.to_photo`, in NumPy: tables have pairs of every length, and JAX would compile it
+    for each. Raises TableError where one sigma cannot serve two pixel sizes.
     """
     coordinates = []
     for camera, (u, v) in ((left, measured.coordinates[:2]), (right, measured.coordinates[2:])):
         u0, v0 = camera.principal_point
         sign = -1.0 if camera.y_down else 1.0
         coordinates += [(u - u0) * camera.pixel_size, sign * (v - v0) * camera.pixel_size]
-    deviation = measured.sigma
     count = len(measured.points)
-    if deviation is None:
-        deviation = np.ones(count) if sigma is None else np.full(count, sigma * left.pixel_size)
-    else:
-        deviation = deviation * left.pixel_size
-    if left.pixel_size != right.pixel_size and (sigma is not None or measured.sigma is not None):
-        found = f"sigma with pixel sizes {left.pixel_size!r} (left) and {right.pixel_size!r} (right)"
-        expected = "coordinates in photo units where the pixel sizes differ, so that one sigma serves both photos"
-        raise TableError(file, measured.lines[0], "sigma", found, expected)
-    focals = np.float64(left.focal), np.float64(right.focal)
-    return Pair(*coordinates, deviation, np.ones(count, bool), *focals)
+    deviation = np.ones(count)
+    if measured.sigma is not None or sigma is not None:
+        deviation = (np.full(count, sigma) if measured.sigma is None else measured.sigma) * left.pixel_size
+        if left.pixel_size != right.pixel_size:
+            found = f"sigma with pixel sizes {left.pixel_size!r} (left) and {right.pixel_size!r} (right)"
+            expected = "coordinates in photo units where the pixel sizes differ, so that one sigma serves both photos"
+            raise TableError(file, measured.lines[0], "sigma", found, expected)
+    fields = (*coordinates, deviation, np.ones(count, bool), np.float64(left.focal), np.float64(right.focal))
+    return Pair(*map(jnp.asarray, fields))

@@ -41,9 +41,11 @@ def write(directory: Path, solved: list[Solution], units: Units, summary: dict[s
         draft.mkdir(parents=True)
         for name, text in texts.items():
             (draft / name).write_text(text, encoding="utf-8", newline="")
-        directory.mkdir(exist_ok=True)
-        for name in texts:
-            os.replace(draft / name, directory / name)
+        if directory.exists():
+            for name in texts:
+                os.replace(draft / name, directory / name)
+        else:
+            os.replace(draft, directory)
     except OSError as error:
         raise TableError(directory, None, None, error.strerror or str(error), "a folder that can be written") from None
     finally:
@@ -55,10 +57,10 @@ POINTS = ("X", "Y", "Z")
 
 
 def _element_rows(solved: list[Solution], units: Units) -> list[list[Any]]:
-    header = ["pair", "result", "points", "degrees_of_freedom", "iterations"]
+    header: list[Any] = ["pair", "result", "points", "degrees_of_freedom", "iterations"]
     for e in solved[0].elements:
         header += [_head(e.name, e.unit)] + ([] if e.deviation is None else [_head(f"sd_{e.name}", e.unit)])
-    rows = [[*header, _head("m_q", units.photo), _head("sigma0", units.sigma0), "advice"]]
+    rows: list[list[Any]] = [[*header, _head("m_q", units.photo), _head("sigma0", units.sigma0), "advice"]]
     for s in solved:
         row = [s.measured.name, s.result, len(s.measured.points), *_counts(s).values()]
         for e in s.elements:
@@ -69,7 +71,7 @@ def _element_rows(solved: list[Solution], units: Units) -> list[list[Any]]:
 
 def _point_rows(solved: list[Solution], keys: tuple[str, ...], units: Units) -> list[list[Any]]:
     unit = {"redundancy": "", "in_front": "", **dict.fromkeys(POINTS, units.model)}
-    rows = [["pair", "point", *(_head(key, unit.get(key, units.photo)) for key in keys)]]
+    rows: list[list[Any]] = [["pair", "point", *(_head(key, unit.get(key, units.photo)) for key in keys)]]
     for s in solved:
         rows += [[s.measured.name, values["point"], *(values[key] for key in keys)] for values in s.points]
     return rows

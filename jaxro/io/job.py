@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -26,6 +25,9 @@ SYSTEMS: dict[str, type[AbstractElements]] = {
     "dependent": DependentElements,
     "independent": IndependentElements,
 }
+CHEAP = 1_000_000
+"""Padded points that take less time to calculate than another program takes to compile."""
+
 RESIDUALS = {"rigorous": coplanarity.rigorous, "parallax": coplanarity.parallax}
 
 
@@ -120,7 +122,9 @@ def read_cameras(options: Options, table: tables.Table) -> list[tuple[Camera, Ca
 def _check_numbers(options: Options, table: tables.Table, system: type[AbstractElements]) -> None:
     if options.sigma is not None:
         if table.has_sigma:
-            raise TableError("--sigma", None, None, f"it beside the column sigma of {table.file}", "only one of the two")
+            raise TableError(
+                "--sigma", None, None, f"it beside the column sigma of {table.file}", "only one of the two"
+            )
         if not (math.isfinite(options.sigma) and options.sigma > 0):
             raise TableError("--sigma", None, None, repr(options.sigma), "a positive standard deviation")
     if options.base is not None:
@@ -133,46 +137,49 @@ def _check_numbers(options: Options, table: tables.Table, system: type[AbstractE
 
 
 def orient_all(pairs: list[Pair], keywords: dict[str, Any], progress: Callable[[int], None]) -> list[Orientation]:
-    """Every pair oriented, in order. Pairs are padded to powers of two so that few lengths are compiled.
+    """Every pair oriented, in order, as NumPy values; padding of many pairs is left in place.
 
     `progress` is told the number of pairs finished so far.
     """
-    compiled = eqx.filter_jit(orient)
     if len(pairs) == 1:
-        one = jax.tree.map(np.asarray, compiled(pairs[0], **keywords))
+        one = jax.tree.map(np.asarray, orient(pairs[0], **keywords))
         progress(1)
         return [one]
     from ..batch import orient_batch
 
-    buckets: dict[int, list[int]] = defaultdict(list)
-    for i, pair in enumerate(pairs):
-        buckets[max(8, 1 << (len(pair.x_left) - 1).bit_length())].append(i)
     out: list[Any] = [None] * len(pairs)
     finished = 0
-    for size, members in sorted(buckets.items()):
-        batch = jax.tree.map(lambda *fields: np.stack(fields), *[_padded(pairs[i], size) for i in members])
+    for size, members in buckets([len(pair.x_left) for pair in pairs]).items():
+        batch = _batch([pairs[i] for i in members], size)
         told = lambda done, total, before=finished: progress(before + done)
-        oriented = jax.tree.map(np.asarray, orient_batch(batch, progress=told, **keywords))
+        solved = jax.tree.map(np.asarray, orient_batch(batch, progress=told, **keywords))
         for row, i in enumerate(members):
-            out[i] = _row(oriented, row, len(pairs[i].x_left))
+            out[i] = jax.tree.map(lambda a, row=row: a[row], solved)
         finished += len(members)
     return out
 
 
-def _padded(pair: Pair, size: int) -> Pair:
-    """`jaxro.pad` in NumPy: thousands of lengths, nothing to compile."""
-    missing = (0, size - len(pair.x_left))
-    fill = lambda a, value=0.0: np.pad(a, missing, constant_values=value)
-    return Pair(
-        *map(fill, pair.coordinates), fill(pair.sigma, 1.0), fill(pair.mask, False), pair.focal_left, pair.focal_right
-    )
+def buckets(lengths: list[int]) -> dict[int, list[int]]:
+    """Indices of the pairs to be padded to each number of points, a power of two of at least 8.
+
+    A few short pairs go along with longer ones: calculating with their padding is cheaper than compiling once more.
+    """
+    exact: dict[int, list[int]] = defaultdict(list)
+    for i, length in enumerate(lengths):
+        exact[max(8, 1 << (length - 1).bit_length())].append(i)
+    out: dict[int, list[int]] = {}
+    size = 0
+    for own in sorted(exact, reverse=True):
+        if not out or len(exact[own]) * size > CHEAP:
+            size = own
+        out.setdefault(size, []).extend(exact[own])
+    return out
 
 
-def _row(batch: Orientation, row: int, points: int) -> Orientation:
-    """One orientation of a batch without its padding."""
-    one = jax.tree.map(lambda a: a[row], batch)
-    per_point = lambda o: (o.parallax, o.residuals, o.corrections, o.redundancy, o.model, o.in_front)
-    return eqx.tree_at(per_point, one, jax.tree.map(lambda a: a[:points], per_point(one)))
+def _batch(pairs: list[Pair], size: int) -> Pair:
+    """`jaxro.stack` padded to `size`, in NumPy: thousands of lengths, nothing to compile."""
+    fitted = lambda field: np.pad(field, (0, size - len(field))) if field.ndim else field
+    return jax.tree.map(lambda *fields: np.stack([fitted(field) for field in fields]), *pairs)
 
 
 def _with_progress(errors, pairs: list[Pair], keywords: dict[str, Any]) -> list[Orientation]:

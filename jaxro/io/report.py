@@ -41,7 +41,9 @@ def _one(console: Console, s: Solution, units: Units, subtitle: str) -> None:
         sigma0 = f"sigma0 {_number(s.sigma0, _digits(s.sigma0))}" + (f" {units.sigma0}" if units.sigma0 else "")
         m_q = f"m_q {_number(s.m_q, _digits(s.m_q))} {units.photo}"
         freedom = int(o.degrees_of_freedom)
-        console.print(f"{sigma0}   {m_q}   {freedom} degree{'s' * (freedom != 1)} of freedom   {o.iterations} iterations")
+        console.print(
+            f"{sigma0}   {m_q}   {freedom} degree{'s' * (freedom != 1)} of freedom   {o.iterations} iterations"
+        )
         high = {pair: r for pair, r in s.correlations.items() if abs(r) > HIGH}
         named = ", ".join(f"{pair} {100 * r:.1f} %" for pair, r in high.items()) or "none"
         console.print(f"Correlations over {HIGH:.0%}: {named}")

@@ -1,4 +1,4 @@
-"""Oriented pairs as reports need them: NumPy values without padding, degrees, names and units.
+"""Oriented pairs as reports need them: NumPy values of the measured points, degrees, names and units.
 
 The terminal report and the files of --out read the same `Solution`s. Where a result is not usable its elements, m_q and
 sigma0 are NaN here; the y-parallaxes, corrections and `in_front` stay where they say which points are at fault.
@@ -85,13 +85,14 @@ class Solution:
         """The values of every point: q, the four corrections, redundancy number, model X Y Z, in_front."""
         o = self.orientation
         shown = self.usable or self.result == "points_behind_camera"
-        numbers = np.stack([o.parallax, *o.corrections, o.redundancy, *o.model])
+        count = len(self.measured.points)  # padding comes after them
+        numbers = np.stack([o.parallax, *o.corrections, o.redundancy, *o.model])[:, :count]
         if not shown:
             numbers = np.full_like(numbers, np.nan)
         elif not self.usable:
             numbers[6:] = np.nan
         keys = ("q", "v_x_left", "v_y_left", "v_x_right", "v_y_right", "redundancy", "X", "Y", "Z")
-        front = [bool(f) if shown else None for f in o.in_front]
+        front = [bool(f) if shown else None for f in o.in_front[:count]]
         return [
             {"point": name, **dict(zip(keys, values, strict=True)), "in_front": f}
             for name, values, f in zip(self.measured.points, numbers.T.tolist(), front, strict=True)
@@ -146,7 +147,11 @@ def shown_elements(orientations: list[Orientation], units: Units) -> list[list[E
     kinds = ["deg" if angle else length for angle in angles]
     out = []
     for o, value, deviation in zip(orientations, (values * scale).tolist(), (deviations * scale).tolist(), strict=True):
-        given = [Element("bx", units.model, float(o.elements.bx), None)] if system is DependentElements else []
+        given = (
+            [Element("bx", units.model, float(o.elements.bx), None)]
+            if isinstance(o.elements, DependentElements)
+            else []
+        )
         out.append(given + [Element(*entry) for entry in zip(names, kinds, value, deviation, strict=True)])
     return out
 
@@ -166,5 +171,3 @@ def solutions(
             solution = Solution(m, c, o, blank)
         out.append(solution)
     return out
-
-

@@ -99,7 +99,7 @@ def parse(text: str, file: str, name: str) -> Table:
     pairs: dict[str, Measurements] = {}
     seen: dict[str, dict[str, int]] = {}
     places: dict[tuple, str] = {}
-    warnings = []
+    twins: dict[str, list[str]] = {}
     for line, row in rows:
         _check_length(row, columns, file, line)
         point = _name(row[columns["point"]], file, line, "point")
@@ -107,21 +107,28 @@ def parse(text: str, file: str, name: str) -> Table:
         first = seen.setdefault(pair, {}).setdefault(point, line)
         if first != line:
             found = f"{point!r} a second time in pair {pair!r} (first on line {first})"
-            raise TableError(file, line, "point", found, "each point once in a pair; rename it or delete one of the two")
+            raise TableError(
+                file, line, "point", found, "each point once in a pair; rename it or delete one of the two"
+            )
         values = tuple(_number(row[columns[c]], file, line, c) for c in numbers)
         twin = places.setdefault((pair, *values[:4]), point)
         if twin != point:
-            warnings.append(
-                f"{file}, line {line}: point {point!r} of pair {pair!r} has the coordinates of point {twin!r}. "
-                "If they are one point measured once it counts twice in the degrees of freedom: delete one."
-            )
+            twins.setdefault(pair, []).append(f"{point} = {twin} (line {line})")
         measured = pairs.setdefault(pair, Measurements(pair))
         measured.points.append(point)
         measured.rows.append(values)
         measured.lines.append(line)
     if not pairs:
         raise TableError(file, line + 1, None, "no points", "one line for every measured point below the header")
-    return Table(file, list(pairs.values()), warnings)
+    return Table(file, list(pairs.values()), [_twins(file, pair, found) for pair, found in twins.items()])
+
+
+def _twins(file: str, pair: str, found: list[str]) -> str:
+    named = ", ".join(found[:5]) + (f" and {len(found) - 5} more" if len(found) > 5 else "")
+    return (
+        f"{file}: in pair {pair!r} the coordinates of a point occur again under another name: {named}. "
+        "Each counts in the degrees of freedom; delete what was measured only once."
+    )
 
 
 def _rows(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
@@ -143,7 +150,9 @@ def _columns(header: list[str], file: str, line: int) -> dict[str, int]:
     """The place of every column by its full name."""
     columns: dict[str, int] = {}
     if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        raise TableError(file, line, None, f"the header {header[0]!r}", "fields separated by commas, decimals by points")
+        raise TableError(
+            file, line, None, f"the header {header[0]!r}", "fields separated by commas, decimals by points"
+        )
     for place, entry in enumerate(header):
         given = entry.strip().lower()
         full = SHORT.get(given, given)

@@ -3,8 +3,9 @@
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool
 
-from ..elements import vertical
+from ..elements import RelativePose, vertical
 from ..normal_equations import steps
 from ..pairs import Pair
 from .base import AbstractStart, Begin, distances, rms_distance
@@ -12,7 +13,7 @@ from .general import General
 
 
 class Auto(AbstractStart):
-    """Two Gauss-Newton steps from the vertical; where they fit, that is the start, elsewhere `general`.
+    """A few Gauss-Newton steps from the vertical; where they fit, that is the start, elsewhere `general`.
 
     "Fit" means: rotation and base within `tilt` (rad) of the normal case and a root mean square distance below
     `tolerance` times the focal length, far above any measuring error and far below what a wrong orientation leaves.
@@ -25,15 +26,17 @@ class Auto(AbstractStart):
     tilt: float = 0.35
     tolerance: float = 1e-3
 
+    def fits(self, pair: Pair, pose: RelativePose) -> Bool[Array, ""]:
+        """Whether a pose reached from the vertical is near it and explains the points; the base may point backwards."""
+        longest = 2 * jnp.maximum(jnp.maximum(jnp.abs(pose.qx), jnp.abs(pose.qy)), jnp.abs(pose.qz))
+        longest = jnp.maximum(longest, jnp.maximum(jnp.abs(pose.by), jnp.abs(pose.bz)))
+        return (longest < self.tilt) & (rms_distance(pair, pose) < self.tolerance)
+
     def __call__(self, pair: Pair) -> Begin:
         zero = jnp.zeros_like(pair.focal_left)
         pose = vertical(pair.focal_left)
-        x = steps(distances(pair, pose), (zero,) * 5, self.steps, 0.5)
-        near = pose.moved(x).normalised()
-        longest = jnp.abs(x[0])
-        for entry in x[1:]:
-            longest = jnp.maximum(longest, jnp.abs(entry))
-        fits = (longest < self.tilt) & (rms_distance(pair, near) < self.tolerance)
+        near = pose.moved(steps(distances(pair, pose), (zero,) * 5, self.steps, 0.5)).normalised()
+        fits = self.fits(pair, near)
 
         # A loop of at most one round: under vmap it is entered only if some pair of the batch needs it, where a
         # `cond` would be turned into a `select` and always compute the general start of every pair.
@@ -47,5 +50,3 @@ class Auto(AbstractStart):
 
         _, pose, ambiguous = lax.while_loop(needed, general, (~fits, near, jnp.zeros_like(fits)))
         return Begin(pose, ambiguous)
-
-

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .. import coplanarity
-from ..adjustment import moved, residual_function
+from ..adjustment import Residuals
 from ..elements import RelativePose
 from ..pairs import Pair
 
@@ -28,12 +28,11 @@ class AbstractStart(eqx.Module):
         """The pose to begin with."""
 
 
-def distances(pair: Pair, pose: RelativePose):
-    """x -> distances of the points from the condition, in the unit of the coordinates, at the displaced pose."""
-    condition, observations, _ = coplanarity.rigorous(pair)
+def distances(pair: Pair, pose: RelativePose) -> Residuals:
+    """Distances of the points from the condition, in the unit of the coordinates, around the pose."""
+    prepare, condition, observations, _ = coplanarity.rigorous(pair)
     unit = (jnp.ones_like(pair.sigma),) * 4
-    residuals = residual_function(condition, observations, unit, pair.mask)
-    return lambda x: residuals(moved(pose, x))
+    return Residuals(prepare, condition, pose, observations, unit, pair.mask)
 
 
 def rms_distance(pair: Pair, pose: RelativePose) -> Float[Array, ""]:

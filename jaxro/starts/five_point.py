@@ -7,27 +7,31 @@ Five points leave E = x E1 + y E2 + z E3 + w E4. The ten cubic equations
 are reduced to one polynomial of degree ten in z / w; each of its real roots is one essential matrix, made exact by
 Gauss-Newton steps on the cubic equations themselves.
 
-Nothing here calls LAPACK or indexes by a computed number. Arrays carry the problems on their last axis, the one along
-which a processor works, whatever `vmap` does outside (`_solve` has its own batching rule). Degenerate points give
-fewer solutions or inexact ones, never NaN.
+Nothing here calls LAPACK or indexes by a computed number. Arrays carry the problems on their last axis (see
+`problems_last`). Degenerate points give fewer solutions or inexact ones, never NaN.
 """
 
 from itertools import combinations_with_replacement
 from math import comb
 
-import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float
+
+from .problems_last import problems_last
 
 TINY = 1e-300
 BISECTIONS = 6
 POLISHING = 2
-RISES = ((1, 2, 3, 4), (5, 6, 7), (8, 9, 10))
+RISES = ((1, 2, 3, 4, 5, 6), (7, 8, 9, 10))
 # x y z w are the letters 0 1 2 3; the first ten monomials are eliminated (Nister's order)
-MONOMIALS = "000 111 001 011 002 003 112 113 012 013 022 023 033 122 123 133 222 223 233 333".split()
+MONOMIALS = tuple(
+    f"{m:03d}" for m in (0, 111, 1, 11, 2, 3, 112, 113, 12, 13, 22, 23, 33, 122, 123, 133, 222, 223, 233, 333)
+)
 SQUARES = tuple(combinations_with_replacement(range(4), 2))
+# which products of a square and a letter make up each monomial
+PRODUCTS = ["".join(sorted(f"{i}{j}{k}")) for i, j in SQUARES for k in range(4)]
+COLLECT = [[float(m == product) for product in PRODUCTS] for m in MONOMIALS]
 
 
 def five_point(
@@ -37,11 +41,10 @@ def five_point(
 
     Image vectors of any length. Places without a solution hold finite numbers without meaning.
     """
-    essentials, real = _solve(left[..., None], right[..., None])
-    return jnp.moveaxis(essentials[..., 0], -1, 0), real[..., 0]
+    essentials, real = _solve_one(left, right)
+    return jnp.moveaxis(essentials, -1, 0), real
 
 
-@custom_vmap
 def _solve(left: Float[Array, "5 3 problem"], right: Float[Array, "5 3 problem"]):
     basis = _null_space((left[:, :, None] * right[:, None, :]).reshape(5, 9, -1)).reshape(4, 3, 3, -1)
     matrix = _elimination(_constraints(basis))
@@ -51,15 +54,7 @@ def _solve(left: Float[Array, "5 3 problem"], right: Float[Array, "5 3 problem"]
     return essentials * jnp.sqrt(2.0), real
 
 
-@_solve.def_vmap
-def _solve_batch(axis_size, in_batched, left, right):
-    """Any vmap from outside only makes the last axis longer."""
-    first, second = (
-        (p if batched else jnp.broadcast_to(p[None], (axis_size, *p.shape))).transpose(1, 2, 0, 3).reshape(5, 3, -1)
-        for p, batched in zip((left, right), in_batched, strict=True)
-    )
-    outputs = [jnp.moveaxis(a.reshape(*a.shape[:-1], axis_size, -1), -2, 0) for a in _solve(first, second)]
-    return tuple(outputs), (True, True)
+_solve_one = problems_last(_solve)
 
 
 def _reflector(x: Float[Array, "n problem"]) -> Float[Array, "n problem"]:
@@ -75,14 +70,22 @@ def _reflected(v: Float[Array, "n problem"], m: Float[Array, "n k problem"]) -> 
 
 
 def _null_space(rows: Float[Array, "5 9 problem"]) -> Float[Array, "4 9 problem"]:
-    """Four orthonormal vectors at right angles to the five rows: the last columns of Q in rowsᵀ = Q R."""
-    m, reflectors = jnp.swapaxes(rows, 0, 1), []
-    for _ in range(5):
-        reflectors.append(_reflector(m[:, 0]))
-        m = _reflected(reflectors[-1], m[:, 1:])[1:]
-    basis = jnp.broadcast_to(jnp.eye(4, dtype=rows.dtype)[:, :, None], (4, 4, rows.shape[-1]))
-    for v in reversed(reflectors):
-        basis = _reflected(v, jnp.pad(basis, ((1, 0), (0, 0), (0, 0))))
+    """Four orthonormal vectors at right angles to the five rows: the last columns of Q in rowsᵀ = Q R.
+
+    After each reflector the first row and column are shifted out, so that every step is the same.
+    """
+
+    def reflect(m, _):
+        v = _reflector(m[:, 0])
+        m = _reflected(v, m)
+        return jnp.pad(m[1:, 1:], ((0, 1), (0, 1), (0, 0))), v
+
+    def undo(basis, v):
+        return _reflected(v, jnp.pad(basis[:-1], ((1, 0), (0, 0), (0, 0)))), None
+
+    _, reflectors = lax.scan(reflect, jnp.swapaxes(rows, 0, 1), length=5)
+    basis = jnp.broadcast_to(jnp.eye(9, 4, dtype=rows.dtype)[:, :, None], (9, 4, rows.shape[-1]))
+    basis, _ = lax.scan(undo, basis, reflectors, reverse=True)
     return jnp.swapaxes(basis, 0, 1)
 
 
@@ -93,59 +96,52 @@ def _constraints(basis: Float[Array, "4 3 3 problem"]) -> Float[Array, "10 20 pr
     half = jnp.asarray([0.5 if i == j else 1.0 for i, j in SQUARES], basis.dtype)[:, None, None, None]
     outer = jnp.sum(one[:, :, None] * two[:, None], axis=3) * half
     symmetric = outer + jnp.swapaxes(outer, 1, 2)
-    identity = jnp.eye(3, dtype=basis.dtype)[None, :, :, None]
     trace = symmetric[:, 0, 0] + symmetric[:, 1, 1] + symmetric[:, 2, 2]
-    symmetric = symmetric - identity * (trace / 2)[:, None, None]
+    symmetric = symmetric - jnp.eye(3, dtype=basis.dtype)[None, :, :, None] * (trace / 2)[:, None, None]
     # term [square, letter]: (E Eᵀ - tr/2) E and row0 . (row1 x row2)
-    cubic = jnp.sum(symmetric[:, None, :, :, None] * basis[None, :, None], axis=3).reshape(10, 4, 9, -1)
+    parts = (symmetric[:, None, :, k, None] * basis[None, :, None, k] for k in range(3))
+    cubic = sum(parts).reshape(40, 9, -1)
     normal = (_cross(one[:, 1], two[:, 2], 1) + _cross(two[:, 1], one[:, 2], 1)) * half[:, 0]
-    determinant = jnp.sum(normal[:, None] * basis[None, :, 0], axis=2)
-    terms = jnp.concatenate([cubic, determinant[:, :, None]], axis=2)
-    columns = dict.fromkeys(MONOMIALS, 0.0)
-    for p, (i, j) in enumerate(SQUARES):
-        for k in range(4):
-            columns["".join(sorted(f"{i}{j}{k}"))] += terms[p, k]
-    return jnp.stack([columns[m] for m in MONOMIALS], axis=1)
+    determinant = jnp.sum(normal[:, None] * basis[None, :, 0], axis=2).reshape(40, 1, -1)
+    terms = jnp.concatenate([cubic, determinant], axis=1)
+    return jnp.swapaxes(jnp.tensordot(jnp.asarray(COLLECT, basis.dtype), terms, 1), 0, 1)
 
 
 def _elimination(m: Float[Array, "10 20 problem"]) -> Float[Array, "3 3 5 problem"]:
     """B(z): three equations B (x, y, 1)ᵀ = 0, [equation, unknown, power of z], from the last six reduced rows."""
-    rows = []
-    for _ in range(10):
-        v = _reflector(m[:, 0])
-        head = m[0] - v[:1] * jnp.sum(v[:, None] * m, axis=0)
-        rows.append(head)
-        m = _reflected(v, m[:, 1:])[1:]
-    reduced: list = [None] * 10
-    for k in reversed(range(4, 10)):
-        row = rows[k][10 - k :]
-        for j in range(k + 1, 10):
-            row = row - rows[k][j - k : j - k + 1] * reduced[j]
-        pivot = rows[k][:1]
-        reduced[k] = row / jnp.where(jnp.abs(pivot) > TINY, pivot, TINY)
-    blocks = []
-    for k in (4, 6, 8):
-        # z times the second row of the two moves its powers up by one
-        e, f = (jnp.stack([_ascending(r, 0, 3), _ascending(r, 3, 3), _ascending(r, 6, 4)]) for r in reduced[k : k + 2])
-        blocks.append(jnp.pad(e, ((0, 0), (0, 1), (0, 0))) - jnp.pad(f, ((0, 0), (1, 0), (0, 0))))
-    return jnp.stack(blocks)
+
+    def reflect(m, _):
+        m = _reflected(_reflector(m[:, 0]), m)
+        below = jnp.pad(m[1:], ((0, 1), (0, 0), (0, 0)))
+        return jnp.concatenate([below[:, 1:10], jnp.zeros_like(below[:, :1]), below[:, 10:]], axis=1), m[0]
+
+    def substitute(below, row):
+        pivot = jnp.where(jnp.abs(row[:1]) > TINY, row[:1], TINY)
+        new = (row[10:] - jnp.sum(row[1:6, None] * below[:5], axis=0)) / pivot
+        return jnp.concatenate([new[None], below[:5]]), None
+
+    _, rows = lax.scan(reflect, m, length=10)
+    reduced, _ = lax.scan(substitute, jnp.zeros_like(rows[4:, 10:]), rows[4:], reverse=True)
+    # ascending powers of z: rows e, f of x²z, x² (then y², xy) combine to e - z f
+    reduced = reduced.reshape(3, 2, 10, -1)
+    parts = [reduced[:, :, i:j][:, :, ::-1] for i, j in ((0, 3), (3, 6), (6, 10))]
+    columns = [jnp.pad(p, ((0, 0), (0, 0), (0, 5 - p.shape[2]), (0, 0))) for p in parts]
+    b = jnp.stack(columns, axis=1)
+    return b[:, :, 0] - jnp.pad(b[:, :, 1, :-1], ((0, 0), (0, 0), (1, 0), (0, 0)))
 
 
-def _ascending(row: Float[Array, "10 problem"], start: int, count: int) -> Float[Array, "4 problem"]:
-    return jnp.pad(row[start : start + count][::-1], ((0, 4 - count), (0, 0)))
+def _times(p: Float[Array, "3 n problem"], q: Float[Array, "3 m problem"]) -> Float[Array, "3 k problem"]:
+    """Products of polynomials: all pairs of coefficients, each row of pairs shifted by one more, summed."""
+    n, m = p.shape[1], q.shape[1]
+    pairs = jnp.pad(p[:, :, None] * q[:, None], ((0, 0), (0, 0), (0, n), (0, 0)))
+    shifted = pairs.reshape(3, n * (m + n), -1)[:, : n * (m + n - 1)].reshape(3, n, m + n - 1, -1)
+    return jnp.sum(shifted, axis=1)
 
 
 def _determinant(b: Float[Array, "3 3 5 problem"]) -> Float[Array, "11 problem"]:
     """det B(z), ascending powers, largest coefficient 1."""
-
-    def times(p, q):
-        n = p.shape[1] + q.shape[1] - 1
-        return sum(p[:, i : i + 1] * jnp.pad(q, ((0, 0), (i, n - i - q.shape[1]), (0, 0))) for i in range(p.shape[1]))
-
-    x, y = b[:, 0, :4], b[:, 1, :4]
-    rolled = [jnp.concatenate([p[i:], p[:i]]) for p in (x, y) for i in (1, 2)]
-    minors = times(rolled[0], rolled[3]) - times(rolled[1], rolled[2])
-    c = jnp.sum(times(b[:, 2], minors), axis=0)
+    x1, x2, y1, y2 = (jnp.concatenate([b[i:, k, :4], b[:i, k, :4]]) for k in (0, 1) for i in (1, 2))
+    c = jnp.sum(_times(b[:, 2], _times(x1, y2) - _times(x2, y1)), axis=0)
     return c / jnp.maximum(jnp.max(jnp.abs(c), axis=0, keepdims=True), TINY)
 
 
@@ -170,8 +166,8 @@ def _real_roots(c: Float[Array, "11 problem"]):
     z = jnp.stack([roots[0], one[1]]).reshape(20, -1)
     w = jnp.stack([one[0], roots[1]]).reshape(20, -1)
     found = found[-1].reshape(20, -1)
-    place = jnp.stack([jnp.sum(found[:i], axis=0) for i in range(20)])
-    chosen = found[None] & (place[None] == jnp.arange(10)[:, None, None])
+    place = jnp.tensordot(jnp.tri(20, k=-1, dtype=c.dtype), found.astype(c.dtype), 1)
+    chosen = found[None] & (place[None] == jnp.arange(10, dtype=c.dtype)[:, None, None])
     real = jnp.any(chosen, axis=1)
     z, w = (jnp.sum(jnp.where(chosen, value[None], 0.0), axis=1) for value in (z, w))
     return jnp.where(real, z, 1.0), w, real

@@ -1,7 +1,171 @@
-"""The start for photos in any position: candidates from closed forms, chosen by cheirality and residual."""
+"""The start for photos in any position: candidates from closed forms, chosen by cheirality and residual.
 
-from .base import AbstractStart, Begin
-from .vertical import Vertical
+Candidates are the five-point solutions of several spread subsets, the eight-point solution and the vertical case. Those
+with most points in front of both photos and the smallest distances are refined by Gauss-Newton over all points, each
+different from the others, so that a second orientation that fits as well is seen and reported.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from .. import rotations as rot
+from ..elements import RelativePose, vertical
+from ..normal_equations import steps
+from ..pairs import Pair
+from .base import AbstractStart, Begin, distances, rms_distance
+from .decomposition import best_pose, cheirality
+from .eight_point import eight_point
+from .five_point import five_point
+
+BEHIND = 0.25
+"""Share of points behind a photo above which a candidate counts as a wrong decomposition."""
+
+DIFFERENT = 0.05
+"""Angle (rad) between rotations or bases from which two candidates are different orientations."""
+
+
 class General(AbstractStart):
-    def __call__(self, pair):
-        return Vertical()(pair)
+    """Candidates from `subsets` five-point problems; the `refined` best different ones take `steps` Gauss-Newton steps.
+
+    With five points all solutions are candidates; with a plane scene two remain, and `ambiguous` says so.
+    """
+
+    subsets: int = 6
+    refined: int = 4
+    steps: int = 6
+
+    def __call__(self, pair: Pair) -> Begin:
+        left, right = _vectors(pair)
+        poses, real = self._candidates(pair, left, right)
+        score = jnp.where(real, _scores(pair, poses, left, right), jnp.inf)
+        chosen, found = _best_different(poses, score, self.refined)
+        chosen = jax.vmap(lambda pose: _refined(pair, pose, self.steps))(chosen)
+        score = jnp.where(found, _scores(pair, chosen, left, right), jnp.inf)
+        best, alone = _best_different(chosen, score, 2)
+        first, second = (jax.tree.map(lambda a, i=i: a[i], best) for i in (0, 1))
+        squares, other = rms_distance(pair, first) ** 2, rms_distance(pair, second) ** 2
+        freedom = pair.count - 5
+        slack = jnp.where(freedom > 0, 10 / jnp.where(freedom > 0, freedom, 1.0), 0.0)
+        ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
+        ambiguous = ambiguous & (other < squares * (1 + slack) + 1e-18)
+        turn, parallax = _rotation_only(left, right, pair.mask)
+        pure = parallax < 4 * jnp.sqrt(squares) + 1e-9
+        pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
+        return Begin(pose, ambiguous & ~pure)
+
+    def _candidates(self, pair: Pair, left, right) -> tuple[RelativePose, Bool[Array, " candidate"]]:
+        pick = _subsets(pair.mask, self.subsets)
+        gather = lambda vectors: jnp.sum(pick[:, :, :, None] * vectors[None, None, :, :], axis=2)
+        essentials, real = jax.vmap(five_point)(gather(left), gather(right))
+        linear = eight_point(left, right, pair.mask.astype(left.dtype))
+        essentials = jnp.concatenate([essentials.reshape(-1, 3, 3), linear[None]])
+        real = jnp.concatenate([real.reshape(-1), (pair.count >= 8)[None]])
+        real = real & jnp.all(jnp.isfinite(essentials), axis=(1, 2))
+        essentials = jnp.where(real[:, None, None], essentials, jnp.eye(3))
+        poses, _ = jax.vmap(lambda e: best_pose(e, left, right, pair.mask))(essentials)
+        normal_case = jax.tree.map(lambda a: a[None], vertical(pair.focal_left))
+        poses = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), poses, normal_case)
+        return poses, jnp.concatenate([real, jnp.ones(1, bool)])
+
+
+def _vectors(pair: Pair) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
+    """Image vectors p / f."""
+    of = lambda x, y, f: jnp.stack([x / f, y / f, -jnp.ones_like(x)], axis=-1)
+    return of(pair.x_left, pair.y_left, pair.focal_left), of(pair.x_right, pair.y_right, pair.focal_right)
+
+
+def _subsets(mask: Bool[Array, " point"], count: int) -> Float[Array, "subset 5 point"]:
+    """Five points each, evenly spread over the numbering and shifted from subset to subset, as selection matrices."""
+    number = jnp.cumsum(mask) - 1
+    total = jnp.maximum(jnp.sum(mask), 1)
+    shift = jnp.arange(count)[:, None] * jnp.maximum(total // (5 * count), 1)
+    rank = (jnp.arange(5)[None, :] * total // 5 + shift) % total
+    return ((number[None, None, :] == rank[:, :, None]) & mask[None, None, :]).astype(jnp.result_type(float))
+
+
+def _behind(pose: RelativePose, left, right, mask) -> Float[Array, ""]:
+    """Share of the points behind one of the photos."""
+    rotation, base = pose.relative()
+    front = cheirality(rot.as_array(rotation), rot.as_array(base), left, right, mask)
+    total = jnp.maximum(jnp.sum(mask), 1).astype(left.dtype)
+    return 1 - jnp.asarray(front, left.dtype) / total
+
+
+def _scores(pair: Pair, poses: RelativePose, left, right) -> Float[Array, " candidate"]:
+    """Mean square distance over f², plus one where too many points lie behind a photo."""
+
+    def one(pose):
+        wrong = _behind(pose, left, right, pair.mask) > BEHIND
+        score = rms_distance(pair, pose) ** 2 + jnp.where(wrong, 1.0, 0.0)
+        return jnp.where(jnp.isfinite(score), score, jnp.inf)
+
+    return jax.vmap(one)(poses)
+
+
+def _best_different(poses: RelativePose, score: Float[Array, " candidate"], count: int):
+    """The `count` best candidates that differ from one another, best first, and which of them exist."""
+
+    def body(k, state):
+        chosen, found, score = state
+        best = jnp.arange(score.shape[0]) == jnp.argmin(score)
+        pose = jax.tree.map(lambda a: jnp.sum(jnp.where(best, a, 0.0)), poses)
+        there = jnp.isfinite(jnp.min(score))
+        here = jnp.arange(count) == k
+        chosen = jax.tree.map(lambda a, b: jnp.where(here, b, a), chosen, pose)
+        found = jnp.where(here, there, found)
+        near = jax.vmap(lambda other: _similar(pose, other))(poses)
+        return chosen, found, jnp.where(near | best, jnp.inf, score)
+
+    empty = jax.tree.map(lambda a: jnp.zeros(count, a.dtype), poses)
+    chosen, found, _ = lax.fori_loop(0, count, body, (empty, jnp.zeros(count, bool), score))
+    return chosen, found
+
+
+def _similar(one: RelativePose, other: RelativePose) -> Bool[Array, ""]:
+    """Whether rotation and base agree within DIFFERENT."""
+    q = one.qw * other.qw + one.qx * other.qx + one.qy * other.qy + one.qz * other.qz
+    b = one.bx * other.bx + one.by * other.by + one.bz * other.bz
+    return (jnp.abs(q) > float(np.cos(DIFFERENT / 2))) & (b > float(np.cos(DIFFERENT)))
+
+
+def _refined(pair: Pair, pose: RelativePose, count: int) -> RelativePose:
+    """The pose after some Gauss-Newton steps, or unchanged where they fail."""
+    zero = jnp.zeros_like(pair.focal_left)
+    moved = pose.moved(steps(distances(pair, pose), (zero,) * 5, count, 0.3)).normalised()
+    better = rms_distance(pair, moved) <= rms_distance(pair, pose)
+    return jax.tree.map(lambda new, old: jnp.where(better, new, old), moved, pose)
+
+
+def _rotation_only(left, right, mask) -> tuple[RelativePose, Float[Array, ""]]:
+    """The rotation that best turns the right directions into the left ones, and the parallax (rad) it leaves.
+
+    The quaternion is the eigenvector of Davenport's 4x4 matrix of the largest eigenvalue, found by repeated squaring.
+    """
+    unit = lambda v: v / jnp.sqrt(jnp.sum(v * v, axis=-1, keepdims=True))
+    p, r = unit(left), unit(right)
+    weight = jnp.where(mask, 1.0, 0.0)
+    s = jnp.sum(weight[:, None, None] * p[:, :, None] * r[:, None, :], axis=0)
+    z = (s[2, 1] - s[1, 2], s[0, 2] - s[2, 0], s[1, 0] - s[0, 1])
+    trace = s[0, 0] + s[1, 1] + s[2, 2]
+    corner = s + s.T - trace * jnp.eye(3)
+    side = jnp.stack(z)
+    k = jnp.concatenate([jnp.concatenate([trace[None], side])[None], jnp.concatenate([side[:, None], corner], axis=1)])
+    k = k + jnp.sum(weight) * jnp.eye(4)  # all eigenvalues positive, so that squaring favours the largest
+
+    def square(_, k):
+        k = k / jnp.sqrt(jnp.sum(k * k))
+        return jnp.sum(k[:, :, None] * k[None, :, :], axis=1)
+
+    k = lax.fori_loop(0, 40, square, k / jnp.maximum(jnp.sum(weight), 1.0))
+    longest = jnp.arange(4) == jnp.argmax(jnp.diagonal(k))
+    q = jnp.sum(jnp.where(longest[None, :], k, 0.0), axis=1)
+    q = q / jnp.sqrt(jnp.sum(q * q))
+    zero = jnp.zeros_like(q[0])
+    pose = RelativePose(q[0], q[1], q[2], q[3], zero + 1, zero, zero).normalised()
+    rotation, _ = pose.relative()
+    turned = jax.vmap(lambda v: rot.as_array(rot.apply(rotation, (v[0], v[1], v[2]))))(r)
+    chord = jnp.sum((turned - p) ** 2, axis=1)
+    return pose, jnp.sqrt(jnp.sum(weight * chord) / jnp.maximum(jnp.sum(weight), 1.0))

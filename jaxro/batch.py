@@ -1,0 +1,129 @@
+"""Many pairs at once, on every core.
+
+Pairs go through in slabs of fixed size, a slab in chunks that stay in the cache (`lax.map` over `vmap`), slabs spread
+over threads: XLA releases the interpreter lock and runs a chunk on one core, and nothing in the program calls LAPACK,
+which would deadlock. Pairs that do not start from the vertical are collected and oriented in a second, smaller pass,
+so that they do not hold up their chunk.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .orientation import Orientation, orient, orient_near
+from .pairs import Pair
+from .programs import Program
+from .starts import AbstractStart, Auto
+
+CHUNK = 128
+"""Pairs per chunk: a few hundred kB of working set for tens of points."""
+
+SLAB = 64
+"""Chunks per call of the compiled program: long enough to hide the call, short enough to report progress."""
+
+def orient_batch(
+    pairs: Pair,
+    *,
+    select: Callable[[Orientation], PyTree] = lambda orientation: orientation,
+    progress: Callable[[int, int], None] | None = None,
+    threads: int | None = None,
+    chunk: int = CHUNK,
+    start: AbstractStart | Any = Auto(),  # noqa: B008 (frozen)
+    **options,
+) -> PyTree:
+    """`orient` of every pair of a batch (pairs on the leading axis), on all cores.
+
+    `select` picks what to keep of each orientation, and XLA computes nothing else: `lambda o: o.pose` is a bare solve.
+    `progress(done, total)` is called from the calling thread. Other keywords are those of `orient`. The results are
+    those of `orient` one by one, to rounding.
+    """
+    if pairs.x_left.ndim != 2:
+        raise ValueError(f"orient_batch takes a batch of pairs (pair, point), got coordinates of {pairs.x_left.shape}")
+    if options.get("base") is not None:
+        options["base"] = jnp.asarray(options["base"], pairs.x_left.dtype)  # an argument: no program for each value
+    options = options | {"select": select, "chunk": chunk}
+    host = jax.tree.map(np.asarray, pairs)
+    report = progress or (lambda done, total: None)
+    if not isinstance(start, Auto):
+        return _finish(_spread(host, Program(_slab, options | {"start": start}), threads, chunk, report))
+    out, fits = _spread(host, Program(_slab_near, options | {"start": start}), threads, chunk, report)
+    rest = np.flatnonzero(~fits)
+    if rest.size:
+        left_over = jax.tree.map(lambda a: a[rest], host)
+        general = Program(_slab, options | {"start": start.general})
+        again = _spread(left_over, general, threads, chunk, lambda done, total: None)
+        for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(again), strict=True):
+            target[rest] = source
+    return _finish(out)
+
+
+def _chunked(one: Callable, pairs: Pair, chunk: int) -> PyTree:
+    """`one` of every pair, chunk after chunk."""
+    count = pairs.x_left.shape[0]
+    if count <= chunk:
+        return jax.vmap(one)(pairs)
+    split = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), pairs)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), jax.lax.map(jax.vmap(one), split))
+
+
+def _slab(pairs: Pair, *, select: Callable, chunk: int, **options) -> PyTree:
+    return _chunked(lambda pair: select(orient(pair, **options)), pairs, chunk)
+
+
+def _slab_near(pairs: Pair, *, select: Callable, chunk: int, start: Auto, **options) -> tuple[PyTree, Array]:
+    def one(pair: Pair):
+        orientation, fits = orient_near(pair, start=start, **options)
+        return select(orientation), fits
+
+    return _chunked(one, pairs, chunk)
+
+
+def _spread(pairs: Pair, run: Program, threads: int | None, chunk: int, report: Callable) -> PyTree:
+    """All slabs through the program, as NumPy arrays."""
+    total = pairs.x_left.shape[0]
+    workers = threads or len(os.sched_getaffinity(0))
+    if total <= chunk:
+        size = 1 << max(total - 1, 0).bit_length()
+    else:
+        size = chunk * min(SLAB, -(-total // (chunk * workers)))
+    struct = run.shapes(jax.tree.map(lambda a: jax.ShapeDtypeStruct((size, *a.shape[1:]), a.dtype), pairs))
+    out = jax.tree.map(lambda s: np.empty((total, *s.shape[1:]), s.dtype), struct)
+
+    def work(first: int) -> int:
+        last = min(first + size, total)
+        part = jax.tree.map(lambda a: _filled(a[first:last], size), pairs)
+        for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(run(part)), strict=True):
+            target[first:last] = np.asarray(source)[: last - first]
+        return last - first
+
+    firsts = range(0, total, size)
+    done = work(0)  # compiles; the threads then find the program ready
+    report(done, total)
+    if len(firsts) == 1 or workers == 1:
+        for first in firsts[1:]:
+            done += work(first)
+            report(done, total)
+        return out
+    with ThreadPoolExecutor(workers) as pool:
+        for future in as_completed([pool.submit(work, first) for first in firsts[1:]]):
+            done += future.result()
+            report(done, total)
+    return out
+
+
+def _filled(a: np.ndarray, size: int) -> np.ndarray:
+    """The array with zeros (mask False: empty pairs) up to `size` rows."""
+    if a.shape[0] == size:
+        return a
+    return np.concatenate([a, np.zeros((size - a.shape[0], *a.shape[1:]), a.dtype)])
+
+
+def _finish(out: PyTree) -> PyTree:
+    """NumPy leaves as JAX arrays."""
+    return jax.tree.map(jnp.asarray, out)

@@ -1,0 +1,64 @@
+"""Compiled programs of functions that have static options, and the compiler settings that make them fast.
+
+A program is cached by its function and its static options (classes, modules, plain values), so that a second call with
+the same options compiles nothing.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import PyTree
+
+FAST = {
+    "xla_cpu_enable_fast_math": True,
+    "xla_cpu_fast_math_honor_nans": True,
+    "xla_cpu_fast_math_honor_infs": True,
+    "xla_cpu_fast_math_honor_division": True,
+    "xla_cpu_fast_math_honor_functions": True,
+}
+"""Sums may be reordered, without which the CPU cannot vectorise them; NaN, infinity and division stay exact."""
+
+
+class _Key:
+    """Static options, compared by value."""
+
+    def __init__(self, tree: PyTree):
+        self.tree = tree
+        leaves, structure = jax.tree.flatten(tree)
+        self.key = (tuple(leaves), structure)
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other) -> bool:
+        return self.key == other.key
+
+
+class Program:
+    """data -> function(data, **options), compiled; arrays among the options are passed along as arguments."""
+
+    def __init__(self, function: Callable, options: dict[str, Any]):
+        self._arrays, static = eqx.partition(options, eqx.is_array)
+        self._static = _Key(static)
+        self._function = function
+
+    def __call__(self, data: PyTree) -> PyTree:
+        return _compiled(self._function, self._static)(data, self._arrays)
+
+    def shapes(self, data: PyTree) -> PyTree:
+        """Shapes and types of the result, from those of the data."""
+        return jax.eval_shape(lambda data: self._function(data, **eqx.combine(self._arrays, self._static.tree)), data)
+
+
+@lru_cache(maxsize=64)
+def _compiled(function: Callable, static: _Key) -> Callable:
+    settings = FAST if jax.default_backend() == "cpu" else None
+    return jax.jit(lambda data, arrays: function(data, **eqx.combine(arrays, static.tree)), compiler_options=settings)
+
+
+def traced(tree: PyTree) -> bool:
+    """Whether any array of the tree is being traced by jit, vmap or grad."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
