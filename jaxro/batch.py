@@ -21,11 +21,13 @@ from .pairs import Pair
 from .programs import Program
 from .starts import AbstractStart, Auto
 
-CHUNK = 128
-"""Pairs per chunk: a few hundred kB of working set for tens of points."""
+CHUNK_POINTS = 4096
+"""Points per chunk: a working set of a few hundred kB, which stays in the cache of one core."""
 
-SLAB = 64
-"""Chunks per call of the compiled program: long enough to hide the call, short enough to report progress."""
+SLAB_POINTS = 1 << 17
+"""Points per call of the compiled program: long enough to hide the call, short enough that the memory of one result is
+used again for the next and that progress is seen."""
+
 
 def orient_batch(
     pairs: Pair,
@@ -33,7 +35,7 @@ def orient_batch(
     select: Callable[[Orientation], PyTree] = lambda orientation: orientation,
     progress: Callable[[int, int], None] | None = None,
     threads: int | None = None,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     start: AbstractStart | Any = Auto(),  # noqa: B008 (frozen)
     **options,
 ) -> PyTree:
@@ -45,6 +47,9 @@ def orient_batch(
     """
     if pairs.x_left.ndim != 2:
         raise ValueError(f"orient_batch takes a batch of pairs (pair, point), got coordinates of {pairs.x_left.shape}")
+    points = pairs.x_left.shape[1]
+    if chunk is None:
+        chunk = min(128, max(4, 1 << (CHUNK_POINTS // max(points, 1)).bit_length() - 1))
     if options.get("base") is not None:
         options["base"] = jnp.asarray(options["base"], pairs.x_left.dtype)  # an argument: no program for each value
     options = options | {"select": select, "chunk": chunk}
@@ -91,19 +96,21 @@ def _spread(pairs: Pair, run: Program, threads: int | None, chunk: int, report: 
     if total <= chunk:
         size = 1 << max(total - 1, 0).bit_length()
     else:
-        size = chunk * min(SLAB, -(-total // (chunk * workers)))
-    struct = run.shapes(jax.tree.map(lambda a: jax.ShapeDtypeStruct((size, *a.shape[1:]), a.dtype), pairs))
-    out = jax.tree.map(lambda s: np.empty((total, *s.shape[1:]), s.dtype), struct)
+        most = max(1, SLAB_POINTS // (chunk * max(pairs.x_left.shape[1], 1)))
+        size = chunk * min(most, -(-total // (chunk * workers)))
+    firsts = range(0, total, size)
+    part = lambda first: run(jax.tree.map(lambda a: _filled(a[first : first + size], size), pairs))
+    begun = part(0)  # compiles; the threads then find the program ready
+    out = jax.tree.map(lambda a: np.empty((total, *a.shape[1:]), a.dtype), begun)
 
-    def work(first: int) -> int:
+    def store(first: int, result: PyTree) -> int:
         last = min(first + size, total)
-        part = jax.tree.map(lambda a: _filled(a[first:last], size), pairs)
-        for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(run(part)), strict=True):
+        for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(result), strict=True):
             target[first:last] = np.asarray(source)[: last - first]
         return last - first
 
-    firsts = range(0, total, size)
-    done = work(0)  # compiles; the threads then find the program ready
+    work = lambda first: store(first, part(first))
+    done = store(0, begun)
     report(done, total)
     if len(firsts) == 1 or workers == 1:
         for first in firsts[1:]:

@@ -15,10 +15,10 @@ from .elements import AbstractElements, DependentElements, IndependentElements, 
 from .losses import AbstractLoss
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned
-from .programs import Program, traced
+from .programs import QUICK, Program, traced
 from .results import RESULTS, is_usable
 
-WEAK = 0.2
+WEAK = 0.04
 """Standard deviation (rad) of a local parameter above which the linearised statistics no longer mean anything."""
 
 AT_INFINITY = 1e-3
@@ -43,31 +43,31 @@ class Orientation(eqx.Module):
 
     pose: RelativePose
     elements: AbstractElements
-    cofactor: Float[Array, "5 5"]
-    parallax: Float[Array, " point"]
-    residuals: Float[Array, " point"]
+    cofactor: Float[Array, "*pairs 5 5"]
+    parallax: Float[Array, "*pairs point"]
+    residuals: Float[Array, "*pairs point"]
     corrections: Coordinates
-    redundancy: Float[Array, " point"]
-    model: tuple[Float[Array, " point"], Float[Array, " point"], Float[Array, " point"]]
-    in_front: Bool[Array, " point"]
-    m_q: Float[Array, ""]
-    sigma0: Float[Array, ""]
-    degrees_of_freedom: Int[Array, ""]
-    iterations: Int[Array, ""]
+    redundancy: Float[Array, "*pairs point"]
+    model: tuple[Float[Array, "*pairs point"], Float[Array, "*pairs point"], Float[Array, "*pairs point"]]
+    in_front: Bool[Array, "*pairs point"]
+    m_q: Float[Array, "*pairs"]
+    sigma0: Float[Array, "*pairs"]
+    degrees_of_freedom: Int[Array, "*pairs"]
+    iterations: Int[Array, "*pairs"]
     result: RESULTS
 
     @property
-    def covariance(self) -> Float[Array, "5 5"]:
+    def covariance(self) -> Float[Array, "*pairs 5 5"]:
         """sigma0² times the cofactors (a posteriori)."""
         return self.sigma0[..., None, None] ** 2 * self.cofactor
 
     @property
-    def deviations(self) -> Float[Array, "5"]:
+    def deviations(self) -> Float[Array, "*pairs 5"]:
         """Standard deviations of the elements."""
         return self.sigma0[..., None] * jnp.sqrt(jnp.diagonal(self.cofactor, axis1=-2, axis2=-1))
 
     @property
-    def usable(self) -> Bool[Array, ""]:
+    def usable(self) -> Bool[Array, "*pairs"]:
         """Whether the elements may be used; `result` says why not, or what to mind."""
         return is_usable(self.result)
 
@@ -107,13 +107,12 @@ def orient(
     options = dict(elements=elements, base=base, residual=residual, loss=loss, solver=solver, max_steps=max_steps)
     if traced((pair, base, start)):
         return _orient(pair, start=start, **options)
+    run = lambda function, start: Program(function, options | {"start": start}, QUICK)(pair)
     if not isinstance(start, starts.Auto):
-        return Program(_orient, options | {"start": start})(pair)
+        return run(_orient, start)
     # Two small programs instead of one large: the general start is compiled when a pair first needs it.
-    orientation, fits = Program(orient_near, options | {"start": start})(pair)
-    if bool(fits):
-        return orientation
-    return Program(_orient, options | {"start": start.general})(pair)
+    orientation, fits = run(orient_near, start)
+    return orientation if bool(fits) else run(_orient, start.general)
 
 
 NEAR_STEPS = 10
@@ -128,7 +127,8 @@ def orient_near(pair: Pair, *, start: starts.Auto, max_steps: int = 30, **option
 
 def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_steps) -> Orientation:
     pair, bad_input = cleaned(pair)
-    begin = starts.Begin(start, False) if isinstance(start, AbstractElements) else start(pair)
+    # The optimum does not depend on where it is sought, so no derivative passes through the start.
+    begin = starts.Begin(start, False, False) if isinstance(start, AbstractElements) else start(lax.stop_gradient(pair))
     prepare, condition, observations, cofactor = residual(pair)
     adjustment = adjust(
         condition,
@@ -180,7 +180,8 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
         (noise**2 * worst > WEAK**2, RESULTS.weakly_determined),
     ):
         result = RESULTS.where(fair & condition_holds, code, result)
-    result = RESULTS.where(_pure_rotation(pair, pose, noise), RESULTS.zero_base, result)
+    rotated = _pure_rotation(pair, pose, noise) | begin.pure_rotation
+    result = RESULTS.where(rotated, RESULTS.zero_base, result)
     result = RESULTS.where(freedom < 0, RESULTS.too_few_points, result)
     result = RESULTS.where(bad_input, RESULTS.non_finite_input, result)
     return Orientation(

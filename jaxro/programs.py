@@ -22,6 +22,10 @@ FAST = {
 """Sums may be reordered, without which the CPU cannot vectorise them; NaN, infinity and division stay exact."""
 
 
+QUICK = {**FAST, "xla_cpu_use_fusion_emitters": False}
+"""For single pairs: the older code generator takes half the time to compile."""
+
+
 class _Key:
     """Static options, compared by value."""
 
@@ -40,23 +44,30 @@ class _Key:
 class Program:
     """data -> function(data, **options), compiled; arrays among the options are passed along as arguments."""
 
-    def __init__(self, function: Callable, options: dict[str, Any]):
+    def __init__(self, function: Callable, options: dict[str, Any], settings: dict[str, bool] = FAST):
+        self._settings = tuple(settings.items())
         self._arrays, static = eqx.partition(options, eqx.is_array)
         self._static = _Key(static)
         self._function = function
 
     def __call__(self, data: PyTree) -> PyTree:
-        return _compiled(self._function, self._static)(data, self._arrays)
-
-    def shapes(self, data: PyTree) -> PyTree:
-        """Shapes and types of the result, from those of the data."""
-        return jax.eval_shape(lambda data: self._function(data, **eqx.combine(self._arrays, self._static.tree)), data)
+        return _compiled(self._function, self._static, self._settings)(data, self._arrays)
 
 
 @lru_cache(maxsize=64)
-def _compiled(function: Callable, static: _Key) -> Callable:
-    settings = FAST if jax.default_backend() == "cpu" else None
-    return jax.jit(lambda data, arrays: function(data, **eqx.combine(arrays, static.tree)), compiler_options=settings)
+def _compiled(function: Callable, static: _Key, settings: tuple) -> Callable:
+    known = _known(settings) if jax.default_backend() == "cpu" else None
+    return jax.jit(lambda data, arrays: function(data, **eqx.combine(arrays, static.tree)), compiler_options=known)
+
+
+@lru_cache
+def _known(settings: tuple) -> dict[str, bool] | None:
+    """The settings if this compiler has them all (their names are its own and may go), else none."""
+    try:
+        jax.jit(lambda: 0, compiler_options=dict(settings)).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return None
+    return dict(settings)
 
 
 def traced(tree: PyTree) -> bool:

@@ -31,7 +31,7 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "Add points in the empty zones."
     )
     weakly_determined = (
-        "The elements follow from the points only with a standard deviation above 0.2 rad: the layout is too small or "
+        "The elements follow from the points only with a standard deviation above 0.04 rad (2°): the layout is too small or "
         "too one-sided for its accuracy. Add points far from the present ones."
     )
     zero_base = (

@@ -43,10 +43,9 @@ class Auto(AbstractStart):
         def needed(state):
             return state[0]
 
-        def general(state) -> tuple:
-            begin = self.general(pair)
+        def general(state) -> tuple[Array, Begin]:
             pick = lambda new, old: jnp.where(state[0], new, old)
-            return jnp.zeros_like(state[0]), jax.tree.map(pick, begin.pose, state[1]), begin.ambiguous & state[0]
+            return jnp.zeros_like(state[0]), jax.tree.map(pick, self.general(pair), state[1])
 
-        _, pose, ambiguous = lax.while_loop(needed, general, (~fits, near, jnp.zeros_like(fits)))
-        return Begin(pose, ambiguous)
+        no = jnp.zeros_like(fits)
+        return lax.while_loop(needed, general, (~fits, Begin(near, no, no)))[1]

@@ -14,10 +14,11 @@ from ..pairs import Pair
 
 
 class Begin(NamedTuple):
-    """A pose to begin with, and whether another one fits the points as well."""
+    """A pose to begin with, whether another one fits the points as well, and whether a rotation alone explains them."""
 
     pose: RelativePose
     ambiguous: Bool[Array, ""]
+    pure_rotation: Bool[Array, ""]
 
 
 class AbstractStart(eqx.Module):

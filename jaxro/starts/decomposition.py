@@ -42,7 +42,8 @@ def best_pose(
     essential: Float[Array, "3 3"], left: Images, right: Images, mask: Bool[Array, "point"]
 ) -> tuple[RelativePose, Int[Array, ""]]:
     """Of the four orientations of E the one with most points in front of both photos, and their number."""
-    return _best_pose_one(essential, left, right, mask)
+    rotation, base, most = _best_pose_one(essential, left, right, mask)
+    return RelativePose(*rot.to_quaternion(rot.as_matrix(rotation)), base[0], base[1], base[2]), most
 
 
 def _decompose(essential: Square) -> tuple[Float[Array, "2 3 3 problem"], Three]:
@@ -62,7 +63,7 @@ def _decompose(essential: Square) -> tuple[Float[Array, "2 3 3 problem"], Three]
     return jnp.moveaxis(lax.fori_loop(0, POLAR_STEPS, _polar_step, both), 2, 0), base
 
 
-def _best_pose(essential: Square, left, right, mask) -> tuple[RelativePose, Int[Array, "problem"]]:
+def _best_pose(essential: Square, left, right, mask) -> tuple[Square, Three, Int[Array, "problem"]]:
     rotations, base = _decompose(essential)
     (positive, negative), (others, opposite) = (
         _in_front(r, base, left, right, mask) for r in (rotations[0], rotations[1])
@@ -70,9 +71,8 @@ def _best_pose(essential: Square, left, right, mask) -> tuple[RelativePose, Int[
     second = jnp.maximum(others, opposite) > jnp.maximum(positive, negative)
     rotation = jnp.where(second[None, None], rotations[1], rotations[0])
     base = base * jnp.where(jnp.where(second, opposite > others, negative > positive), -1.0, 1.0)[None]
-    quaternion = rot.to_quaternion(rot.as_matrix(rotation))
     most = jnp.maximum(jnp.maximum(positive, negative), jnp.maximum(others, opposite))
-    return RelativePose(*quaternion, base[0], base[1], base[2]), most
+    return rotation, base, most
 
 
 def _in_front(rotation: Square, base: Three, left, right, mask):

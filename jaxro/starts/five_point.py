@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from .problems_last import problems_last
 
 TINY = 1e-300
-BISECTIONS = 6
+ROOT_STEPS = 6
 POLISHING = 2
 RISES = ((1, 2, 3, 4, 5, 6), (7, 8, 9, 10))
 # x y z w are the letters 0 1 2 3; the first ten monomials are eliminated (Nister's order)
@@ -210,7 +210,7 @@ def _risen(roots: Float[Array, "2 n problem"], polynomial):
         inside = jnp.clip(x - correction, a, b)
         return a, b, jnp.where(jnp.abs(correction) <= b - a, inside, (a + b) / 2)
 
-    x = lax.fori_loop(0, BISECTIONS, step, (a, b, x))[2]
+    x = lax.fori_loop(0, ROOT_STEPS, step, (a, b, x))[2]
     return jnp.where(found, x, better), found
 
 

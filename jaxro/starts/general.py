@@ -54,7 +54,7 @@ class General(AbstractStart):
         turn, parallax = _rotation_only(left, right, pair.mask)
         pure = parallax < 4 * jnp.sqrt(squares) + 1e-9
         pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
-        return Begin(pose, ambiguous & ~pure)
+        return Begin(pose, ambiguous & ~pure, pure)
 
     def _candidates(self, pair: Pair, left, right) -> tuple[RelativePose, Bool[Array, " candidate"]]:
         pick = _subsets(pair.mask, self.subsets)

@@ -11,4 +11,5 @@ class Vertical(AbstractStart):
     """The normal case of aerial photography. Gauss-Newton reaches the solution from rotations of up to about 20°."""
 
     def __call__(self, pair: Pair) -> Begin:
-        return Begin(vertical(pair.focal_left), jnp.zeros_like(pair.focal_left, bool))
+        no = jnp.zeros_like(pair.focal_left, bool)
+        return Begin(vertical(pair.focal_left), no, no)

@@ -1,0 +1,72 @@
+"""Batches: the same results as one by one, from any thread, without LAPACK."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxro
+from jaxro import DependentElements, simulation
+
+
+def mixed(count=150, points=9):
+    """Pairs in any position among near-vertical ones, ragged."""
+    anywhere, _ = simulation.random_pairs(jax.random.key(1), count, points, focal=100.0)
+    key = jax.random.split(jax.random.key(2), count)
+    layout = simulation.standard_layout(points)
+    elements = jaxro.IndependentElements(*(jnp.asarray(a) for a in (0.01, -0.02, 0.015, 0.02, 0.01)))
+    near = jax.vmap(lambda k: simulation.noisy(simulation.mock_pair(layout, elements, focal=100.0), k, 0.01))(key)
+    pick = jnp.arange(count) % 3 == 0
+    choose = lambda a, b: jnp.where(pick.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+    pairs = jax.tree.map(choose, anywhere, near)
+    return pairs.with_mask(jnp.arange(points)[None, :] < 9 - jnp.arange(count)[:, None] % 2)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return mixed()
+
+
+@pytest.mark.parametrize("options", [{}, {"threads": 1, "chunk": 16}, {"elements": DependentElements, "base": 1.0}])
+def test_batch_equals_vmap(pairs, options):
+    batch = jaxro.orient_batch(pairs, **options)
+    single = {k: v for k, v in options.items() if k in ("elements", "base")}
+    loop = jax.jit(jax.vmap(lambda pair: jaxro.orient(pair, **single)))(pairs)
+    np.testing.assert_array_equal(np.asarray(batch.result._value), np.asarray(loop.result._value))
+    for one, other in (
+        (batch.pose.quaternion, loop.pose.quaternion),
+        (batch.pose.base, loop.pose.base),
+        (batch.parallax / 100, loop.parallax / 100),
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_only_what_is_selected_and_progress(pairs):
+    told = []
+    pose = jaxro.orient_batch(
+        pairs, select=lambda o: o.pose, chunk=8, threads=2, progress=lambda done, total: told.append((done, total))
+    )
+    whole = jaxro.orient_batch(pairs)
+    np.testing.assert_allclose(pose.base, whole.pose.base, atol=1e-9)
+    assert [total for _, total in told] == [150] * len(told)
+    assert [done for done, _ in told] == sorted(done for done, _ in told) and told[-1][0] == 150
+
+
+def test_no_lapack_in_the_batch_path(pairs):
+    def both(pairs):
+        derivative = jax.grad(lambda p: jnp.sum(jax.vmap(jaxro.orient)(p).pose.qx), allow_int=True)
+        return jax.vmap(jaxro.orient)(pairs), derivative(pairs).x_left
+
+    text = jax.jit(both).lower(pairs).compile().as_text()
+    for name in ("lapack", "potrf", "geqrf", "gesdd", "getrf", "trsm", "Cholesky", "TriangularSolve", "cholesky("):
+        assert name not in text, name
+
+
+def test_batches_from_two_threads_at_once(pairs):
+    expected = jaxro.orient_batch(pairs, threads=1).pose.base
+    with ThreadPoolExecutor(2) as pool:
+        results = list(pool.map(lambda _: jaxro.orient_batch(pairs).pose.base, range(8)))
+    for base in results:
+        np.testing.assert_array_equal(base, expected)
