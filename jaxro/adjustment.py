@@ -118,18 +118,13 @@ class Residuals(eqx.Module):
     mask: Bool[Array, " group"]
     loss: AbstractLoss | None = None
 
-    def shared(self, *x: Array) -> tuple[Array, ...]:
-        """θ(x), as a flat tuple of numbers; x itself where there is no `prepare`."""
-        if self.prepare is None:
-            return x
-        return tuple(jax.tree.leaves(self.prepare(moved(self.centre, x))))
+    def shared(self, *x: Array) -> PyTree:
+        """θ(x): what `prepare` makes of the parameters, or x itself."""
+        return x if self.prepare is None else jax.tree.map(jnp.asarray, self.prepare(moved(self.centre, x)))
 
-    def group(self, theta: tuple[Array, ...], observation: PyTree, cofactor: PyTree, use) -> list:
+    def group(self, theta: PyTree, observation: PyTree, cofactor: PyTree, use) -> list:
         """The m whitened (and, with a loss, transformed) residuals of one group."""
-        if self.prepare is None:
-            prepared = moved(self.centre, theta)
-        else:
-            prepared = jax.tree.unflatten(jax.tree.structure(jax.eval_shape(self.prepare, self.centre)), theta)
+        prepared = moved(self.centre, theta) if self.prepare is None else theta
         r = whitened(self.condition, prepared, observation, cofactor, use)
         return r if self.loss is None else [self.loss.transformed(entry) for entry in r]
 
@@ -155,7 +150,8 @@ class Residuals(eqx.Module):
         for k in range(len(x)):  # one parameter at a time: what it does not touch stays a symbolic zero
             along = lambda t, k=k: self.shared(*x[:k], t, *x[k + 1 :])
             _, slope = jax.jvp(along, (x[k],), (jnp.ones_like(x[k]),))
-            jacobian.append([sum(d * s for d, s in zip(g, slope, strict=True)) for g in gradients])
+            slope = jax.tree.leaves(slope)
+            jacobian.append([sum(d * s for d, s in zip(jax.tree.leaves(g), slope, strict=True)) for g in gradients])
         return r, jacobian
 
 

@@ -64,7 +64,7 @@ def turned(elements: AbstractElements) -> tuple[Matrix, Matrix]:
     base along the photo axis.
     """
     rotation, base = elements.relative()
-    across = jnp.hypot(base[0], base[1])
+    across = rot.length(base[0], base[1])
     x = rot.unit(base)
     y = (-base[1] / across, base[0] / across, jnp.zeros_like(across))
     left = (x, y, rot.cross(x, y))

@@ -158,7 +158,7 @@ class IndependentElements(AbstractElements):
     @classmethod
     def from_relative(cls, rotation: Matrix, base: Vector, length: Scalar) -> "IndependentElements":
         del length
-        phi1 = jnp.arctan2(-base[2], jnp.hypot(base[0], base[1]))
+        phi1 = jnp.arctan2(-base[2], rot.length(base[0], base[1]))
         kappa1 = jnp.arctan2(-base[1], base[0])
         left = rot.product(rot.r_alpha(phi1), rot.r_chi(kappa1))
         phi2, omega2, kappa2 = rot.alpha_omega_chi(rot.product(left, rotation))

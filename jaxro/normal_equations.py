@@ -186,7 +186,9 @@ class SmallCholesky(lx.AbstractLinearSolver):
         flat, unravel = ravel_pytree(vector)
         p = flat.shape[0]
         lower = [[(state[i, j] + state[j, i]) / 2 for j in range(i + 1)] for i in range(p)]
-        return unravel(jnp.stack(solve(lower, [flat[i] for i in range(p)]))), lx.RESULTS.successful, {}
+        x = jnp.stack(solve(lower, [flat[i] for i in range(p)]))
+        # lineax would stop the whole batch for one pair without a derivative
+        return unravel(jnp.where(jnp.isfinite(x), x, 0.0)), lx.RESULTS.successful, {}
 
     def transpose(self, state, options):
         return state, options

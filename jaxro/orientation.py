@@ -24,9 +24,6 @@ WEAK = 0.04
 AT_INFINITY = 1e-3
 """Base over distance below which a point counts as infinitely far, so that the sign of its depth says nothing."""
 
-PURE_ROTATION = 4.0
-"""Parallaxes below this many standard deviations are explained by a rotation alone."""
-
 
 class Orientation(eqx.Module):
     """The relative orientation of a pair; for a batch every field has leading axes.
@@ -284,7 +281,7 @@ def _pure_rotation(pair: Pair, pose: RelativePose, noise) -> Bool[Array, ""]:
     squared, weight = jax.vmap(one)(*pair.coordinates, pair.sigma, pair.mask)
     count = jnp.maximum(pair.count, 1.0)
     rounding = 1e-9 * pair.focal_left * jnp.sqrt(jnp.sum(weight) / count)
-    return jnp.sqrt(jnp.sum(squared) / count) < PURE_ROTATION * noise + rounding
+    return jnp.sqrt(jnp.sum(squared) / count) < starts.significant(pair.count - 5) * noise + rounding
 
 
 def _undefined(system: type[AbstractElements], pose: RelativePose) -> Bool[Array, ""]:
@@ -292,7 +289,7 @@ def _undefined(system: type[AbstractElements], pose: RelativePose) -> Bool[Array
     if system is DependentElements:
         return jnp.abs(pose.bx) < 1e-6
     if system is IndependentElements:
-        return jnp.hypot(pose.bx, pose.by) < 1e-6
+        return rot.length(pose.bx, pose.by) < 1e-6
     return jnp.zeros_like(pose.bx, bool)
 
 

@@ -37,6 +37,12 @@ def scaled(a: Vector, factor: Scalar) -> Vector:
     return (a[0] * factor, a[1] * factor, a[2] * factor)
 
 
+def length(x: Scalar, y: Scalar) -> Scalar:
+    """sqrt(x² + y²). Not `jnp.hypot`: its derivative compares with a maximum and is wrong where the compiler computes
+    that maximum twice with different rounding."""
+    return jnp.sqrt(x * x + y * y)
+
+
 def unit(a: Vector) -> Vector:
     """a / |a|"""
     return scaled(a, 1 / jnp.sqrt(dot(a, a)))
@@ -105,7 +111,7 @@ def r_chi(angle: Scalar) -> Matrix:
 def alpha_omega_chi(r: Matrix) -> Vector:
     """Angles of R = R_alpha R_omega R_chi; |omega| <= pi/2."""
     alpha = jnp.arctan2(-r[0][2], r[2][2])
-    omega = jnp.arctan2(-r[1][2], jnp.hypot(r[1][0], r[1][1]))
+    omega = jnp.arctan2(-r[1][2], length(r[1][0], r[1][1]))
     chi = jnp.arctan2(r[1][0], r[1][1])
     return alpha, omega, chi
 
@@ -122,7 +128,7 @@ def m_omega_phi_kappa(omega: Scalar, phi: Scalar, kappa: Scalar) -> Matrix:
 def omega_phi_kappa(m: Matrix) -> Vector:
     """Angles of M = R3(kappa) R2(phi) R1(omega); |phi| <= pi/2."""
     omega = jnp.arctan2(-m[2][1], m[2][2])
-    phi = jnp.arctan2(m[2][0], jnp.hypot(m[0][0], m[1][0]))
+    phi = jnp.arctan2(m[2][0], length(m[0][0], m[1][0]))
     kappa = jnp.arctan2(-m[1][0], m[0][0])
     return omega, phi, kappa
 

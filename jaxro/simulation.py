@@ -20,8 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from . import elements as el
-from . import rotations as rot
+from . import elements as el, rotations as rot
 from .pairs import Pair, pair
 
 ZONES: dict[int, tuple[float, float]] = {

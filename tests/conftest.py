@@ -1,6 +1,7 @@
 """Strict settings for every test, shapes checked at run time, and the folder of measured data."""
 
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,9 @@ import jax  # noqa: E402
 
 import jaxro  # noqa: E402, F401  (64 bit)
 
+# programs that several tests compile are compiled once; the folder goes with the run
+jax.config.update("jax_compilation_cache_dir", tempfile.mkdtemp(prefix="jaxro-tests-"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

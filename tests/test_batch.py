@@ -1,5 +1,6 @@
 """Batches: the same results as one by one, from any thread, without LAPACK."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -60,8 +61,9 @@ def test_no_lapack_in_the_batch_path(pairs):
         return jax.vmap(jaxro.orient)(pairs), derivative(pairs).x_left
 
     text = jax.jit(both).lower(pairs).compile().as_text()
-    for name in ("lapack", "potrf", "geqrf", "gesdd", "getrf", "trsm", "Cholesky", "TriangularSolve", "cholesky("):
-        assert name not in text, name
+    assert "while" in text
+    assert re.findall(r'custom_call_target="([^"]+)"', text) == []
+    assert not re.search(r"= \S+ (cholesky|triangular-solve)\(", text)
 
 
 def test_batches_from_two_threads_at_once(pairs):

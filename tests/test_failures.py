@@ -90,12 +90,15 @@ def test_zero_base(turn, sigma, count):
 
 
 def test_plane_has_two_solutions():
-    """Of I + b nᵀ/h the second factoring has the base along the plane's normal and all points in front, too."""
+    """The homography I + b nᵀ/h of a plane has a second factoring; it has all points in front if they lie on one side
+    of the middle of the base, and is told apart by the points if they lie on both."""
     rng = np.random.default_rng(5)
-    flat = np.column_stack([rng.uniform(0.2, 0.9, 14), rng.uniform(-0.5, 0.5, 14), -np.full(14, 1.6)])
+    flat = np.column_stack([rng.uniform(0.55, 1.3, 14), rng.uniform(-0.5, 0.5, 14), -np.full(14, 1.6)])
     for sigma in (0.0, 0.005):
         found = outcome(photographed(flat, turn=(0.1, -0.2, 0.9), sigma=sigma))
         assert name(found) == "two_solutions" and bool(found.usable)
+    both_sides = flat - [0.5, 0, 0]
+    assert name(outcome(photographed(both_sides, turn=(0.1, -0.2, 0.9), sigma=0.005))) == "successful"
     relief = flat + np.array([0, 0, 1.0]) * rng.uniform(-0.3, 0.3, (14, 1))
     assert name(outcome(photographed(relief, turn=(0.1, -0.2, 0.9), sigma=0.005))) == "successful"
 

@@ -200,6 +200,22 @@ def test_three_derivatives_agree(system, residual):
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-6 * np.max(np.abs(exact)))
 
 
+@pytest.mark.parametrize("system", (IndependentElements, DependentElements), ids=lambda s: s.__name__)
+def test_accuracy_agrees_with_the_oracle(system):
+    """The cofactors are those of the constrained adjustment in the elements themselves, to the second order in v."""
+    placed = oracles.independent if system is IndependentElements else oracles.dependent(BASE)
+    for seed in range(8):
+        measured = problems.tilted(seed=seed)
+        found = oriented(measured, system)
+        judge = oracles.gauss_helmert(problems.arrays(measured), 70.0, placed, np.array(found.elements.values()))
+        unit = np.where(system.angles, 1.0, BASE)
+        np.testing.assert_allclose(np.array(found.elements.values()) / unit, judge.elements / unit, rtol=0, atol=1e-7)
+        size = np.sqrt(np.outer(np.diag(judge.cofactor), np.diag(judge.cofactor)))
+        np.testing.assert_allclose(found.cofactor / size, judge.cofactor / size, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(found.sigma0, judge.sigma0, rtol=1e-5)
+        np.testing.assert_allclose(found.redundancy, judge.redundancy, rtol=0, atol=1e-5)
+
+
 SOLVERS = {
     "Gauss-Newton": optx.GaussNewton(rtol=1e-12, atol=1e-12),
     "Levenberg-Marquardt": optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12),

@@ -6,7 +6,7 @@ import oracles
 import problems
 import pytest
 
-from jaxro import DependentElements, IndependentElements, coplanarity, simulation
+from jaxro import DependentElements, IndependentElements, coplanarity, pad, simulation
 
 # Dewitt's program on its own sample: photo residuals and object coordinates, Z counted from f below the left station
 DEWITT_RESIDUALS = """
@@ -91,12 +91,13 @@ def by_parallax(pair, **keywords):
 @pytest.mark.parametrize("points", TABLE_1)
 def test_table_1(points):
     printed, mean, m_q = TABLE_1[points]
-    found = by_parallax(problems.table_1(points))
-    np.testing.assert_allclose(100 * found.parallax, [float(v) for v in printed.split()], atol=1.0)
-    np.testing.assert_allclose(100 * np.mean(np.abs(found.parallax)), mean, atol=1.0)
+    found = by_parallax(pad(problems.table_1(points), 16))
+    parallax = np.asarray(found.parallax)[:points]
+    np.testing.assert_allclose(100 * parallax, [float(v) for v in printed.split()], atol=1.0)
+    np.testing.assert_allclose(100 * np.mean(np.abs(parallax)), mean, atol=1.0)
     np.testing.assert_allclose(100 * found.m_q, m_q, atol=1.0)
     judge, _ = oracles.gauss_newton(problems.arrays(problems.table_1(points)), 70.0, 15)
-    np.testing.assert_allclose(found.parallax, judge[-1], atol=1e-9)
+    np.testing.assert_allclose(parallax, judge[-1], atol=1e-9)
 
 
 def test_table_1_without_errors():

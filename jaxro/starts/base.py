@@ -41,3 +41,9 @@ def rms_distance(pair: Pair, pose: RelativePose) -> Float[Array, ""]:
     zero = jnp.zeros_like(pair.focal_left)
     r = distances(pair, pose)((zero,) * 5)
     return jnp.sqrt(jnp.sum(r * r) / jnp.maximum(pair.count, 1.0)) / pair.focal_left
+
+
+def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:
+    """Multiple of sigma0 below which parallaxes are explained by a rotation alone: 4, and more where sigma0 itself is
+    uncertain, having few degrees of freedom."""
+    return 4 + 12 / jnp.maximum(freedom, 1.0)

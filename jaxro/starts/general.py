@@ -15,7 +15,7 @@ from .. import rotations as rot
 from ..elements import RelativePose, vertical
 from ..normal_equations import steps
 from ..pairs import Pair
-from .base import AbstractStart, Begin, distances, rms_distance
+from .base import AbstractStart, Begin, distances, rms_distance, significant
 from .decomposition import best_pose, cheirality
 from .eight_point import eight_point
 from .five_point import five_point
@@ -52,7 +52,8 @@ class General(AbstractStart):
         ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
         ambiguous = ambiguous & (other < squares * (1 + slack) + 1e-18)
         turn, parallax = _rotation_only(left, right, pair.mask)
-        pure = parallax < 4 * jnp.sqrt(squares) + 1e-9
+        noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
+        pure = parallax < significant(freedom) * noise + 1e-9
         pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
         return Begin(pose, ambiguous & ~pure, pure)
 
