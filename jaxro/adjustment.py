@@ -28,8 +28,8 @@ Parameters = Any
 class Adjustment(eqx.Module):
     """A finished adjustment of p parameters from groups of m conditions each.
 
-    `residuals` are whitened: of the unit of sigma0, and dimensionless where the cofactors are true variances. `cofactor`
-    is that of the parameters (for `RelativePose`, of its five local parameters at the solution).
+    `residuals` are whitened: of the unit of sigma0, and dimensionless where the cofactors are true variances.
+    `cofactor` is that of the parameters (for `RelativePose`, of its five local parameters at the solution).
     """
 
     parameters: Parameters
@@ -118,6 +118,10 @@ class Residuals(eqx.Module):
     mask: Bool[Array, " group"]
     loss: AbstractLoss | None = None
 
+    def around(self, centre: Parameters) -> "Residuals":
+        """The same residuals without a loss, around other parameters."""
+        return Residuals(self.prepare, self.condition, centre, self.observations, self.cofactor, self.mask)
+
     def shared(self, *x: Array) -> PyTree:
         """θ(x): what `prepare` makes of the parameters, or x itself."""
         return x if self.prepare is None else jax.tree.map(jnp.asarray, self.prepare(moved(self.centre, x)))
@@ -205,7 +209,9 @@ def adjust(
     if isinstance(parameters, AbstractElements):
         parameters = parameters.normalised()
     converged = solution.result == optx.RESULTS.successful
-    at_solution = eqx.tree_at(lambda r: (r.centre, r.loss), residuals, (parameters, None), is_leaf=lambda leaf: leaf is None)
+    at_solution = eqx.tree_at(
+        lambda r: (r.centre, r.loss), residuals, (parameters, None), is_leaf=lambda leaf: leaf is None
+    )
     return read(at_solution, loss, solution.stats["num_steps"], converged)
 
 
@@ -237,7 +243,7 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
     together = lambda a: a[0] if len(a) == 1 else jnp.stack(a, axis=1)
     freedom = len(r) * jnp.sum(residuals.mask) - p
     checked = freedom > 0
-    variance = squares / jnp.where(checked, freedom, 1).astype(squares.dtype)
+    variance = squares / jnp.where(checked, freedom, 1).astype(r[0].dtype)
     positive = variance > 0
     root = jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1.0)), 0.0)
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)

@@ -99,9 +99,7 @@ def parallax(pair: Pair) -> Adjusted:
         point, measured = observation
         return y_parallax((left, right), point, *focals) - measured
 
-    return Adjusted(
-        prepare, of_point, (pair.coordinates, jnp.zeros_like(pair.sigma)), ((None,) * 4, pair.sigma**2)
-    )
+    return Adjusted(prepare, of_point, (pair.coordinates, jnp.zeros_like(pair.sigma)), ((None,) * 4, pair.sigma**2))
 
 
 def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:

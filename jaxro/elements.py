@@ -25,7 +25,8 @@ from . import rotations as rot
 from .rotations import Matrix, Vector
 
 Scalar = Float[Array, "..."]
-Step = tuple[Scalar, Scalar, Scalar, Scalar, Scalar]
+Step = tuple[Scalar, ...]
+"""Five numbers"""
 
 
 class AbstractElements(eqx.Module):

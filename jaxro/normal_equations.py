@@ -18,9 +18,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
-Scalars = Sequence[Scalar]
+Scalars = Sequence[Any]
 Columns = Sequence[Float[Array, " residual"]]
-Lower = list[list[Scalar]]
+Lower = Sequence[Sequence[Any]]
 """Lower triangle of a symmetric matrix: row i has i + 1 entries."""
 
 UNROLLED = 12
@@ -71,7 +71,7 @@ def cholesky(n: Lower) -> tuple[Lower, Scalar]:
     The relative pivot of a parameter is the part of its diagonal that those before it leave over; pivots below the
     rounding level are lifted to it, so that a singular system gives a large but finite solution.
     """
-    factor: Lower = []
+    factor: list[list[Scalar]] = []
     smallest = jnp.ones_like(n[0][0])
     for i, row in enumerate(n):
         new: list[Scalar] = []
@@ -136,8 +136,9 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
     """Gauss-Newton for a few parameters; its loop carries the parameters and two step sizes, nothing else.
 
     `args` that know their own residuals and columns (`adjustment.Residuals`) are asked for them; any other residual
-    function is linearised. Ends when the *next* step, predicted from the last two, is below atol + rtol |x|. `max_step` bounds the largest
-    component of a step (0.5 rad for orientations, where a longer one leaves the range of the linearisation).
+    function is linearised. Ends when the *next* step, predicted from the last two, is below atol + rtol |x|.
+    `max_step` bounds the largest component of a step (0.5 rad for orientations, where a longer one leaves the range of
+    the linearisation).
     """
 
     rtol: float = 1e-10
@@ -205,6 +206,6 @@ def steps(residuals: Any, x: tuple[Scalar, ...], count: int, max_step: float) ->
     solver = GaussNewton(max_step=max_step)
 
     def body(_, x):
-        return solver.step(None, x, residuals, {}, (x[0], x[0]), frozenset())[0]
+        return solver.step(lambda x, residuals: (residuals(x), None), x, residuals, {}, (x[0], x[0]), frozenset())[0]
 
     return lax.fori_loop(0, count, body, x)

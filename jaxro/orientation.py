@@ -125,7 +125,10 @@ def orient_near(pair: Pair, *, start: starts.Auto, max_steps: int = 30, **option
 def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_steps) -> Orientation:
     pair, bad_input = cleaned(pair)
     # The optimum does not depend on where it is sought, so no derivative passes through the start.
-    begin = starts.Begin(start, False, False) if isinstance(start, AbstractElements) else start(lax.stop_gradient(pair))
+    if isinstance(start, AbstractElements):
+        begin = starts.Begin(start, jnp.asarray(False), jnp.asarray(False))
+    else:
+        begin = start(lax.stop_gradient(pair))
     prepare, condition, observations, cofactor = residual(pair)
     adjustment = adjust(
         condition,
@@ -151,9 +154,7 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     each = lambda function: jax.vmap(function)(pair.coordinates, pair.mask)
     v = each(lambda point, use: coplanarity.corrections(f, point, use))
     parallax = each(
-        lambda point, use: jnp.where(
-            use, coplanarity.y_parallax(frames, point, pair.focal_left, pair.focal_right), 0.0
-        )
+        lambda point, use: jnp.where(use, coplanarity.y_parallax(frames, point, pair.focal_left, pair.focal_right), 0.0)
     )
     corrected = tuple(c + dv for c, dv in zip(pair.coordinates, v, strict=True))
     scale = _scale(chosen, pose, length)
@@ -253,7 +254,7 @@ def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractEl
     return at(origin), jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
 
 
-def _model(pair: Pair, pose: RelativePose, corrected: coplanarity.Point, frame: rot.Matrix):
+def _model(pair: Pair, pose: RelativePose, corrected: Coordinates, frame: rot.Matrix) -> tuple:
     """Model points of the corrected coordinates, which of them lie in front, and which are infinitely far."""
     rotation, base = pose.relative()
 

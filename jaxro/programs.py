@@ -10,6 +10,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+from jax.core import Tracer
 from jaxtyping import PyTree
 
 FAST = {
@@ -72,4 +73,4 @@ def _known(settings: tuple) -> dict[str, Any] | None:
 
 def traced(tree: PyTree) -> bool:
     """Whether any array of the tree is being traced by jit, vmap or grad."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))

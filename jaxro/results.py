@@ -31,8 +31,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "Add points in the empty zones."
     )
     weakly_determined = (
-        "The elements follow from the points only with a standard deviation above 0.04 rad (2°): the layout is too small or "
-        "too one-sided for its accuracy. Add points far from the present ones."
+        "The elements follow from the points only with a standard deviation above 0.04 rad (2°): the layout is too "
+        "small or too one-sided for its accuracy. Add points far from the present ones."
     )
     zero_base = (
         "The photos are explained by a pure rotation: the base is zero (or every point is far away), so neither base "

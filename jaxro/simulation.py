@@ -108,13 +108,13 @@ def mock_pair(
 
 def projected(rotation: rot.Matrix, ray: rot.Vector, focal: ArrayLike) -> tuple[rot.Scalar, rot.Scalar]:
     """Photo coordinates of one ray in a photo turned by `rotation` (photo to model)."""
-    p = rot.apply(rot.transpose(rotation), ray)
+    p, focal = rot.apply(rot.transpose(rotation), ray), jnp.asarray(focal)
     return -focal * p[0] / p[2], -focal * p[1] / p[2]
 
 
 def relief(key: PRNGKeyArray, layout: Layout, amplitude: ArrayLike) -> Float[Array, "point"]:
     """Heights for `mock_pair`, uniform in ±amplitude."""
-    return amplitude * jax.random.uniform(key, (len(layout.x),), float, -1.0, 1.0)
+    return jnp.asarray(amplitude) * jax.random.uniform(key, (len(layout.x),), float, -1.0, 1.0)
 
 
 def planted(
@@ -168,7 +168,7 @@ def _random_pair(key, points, focal, depth):
 
     def photos(key, distance):
         point = rot.scaled(rot.apply(cloud_left, _towards(key, CONE, 1.0)), distance)
-        beyond = tuple(p - b for p, b in zip(point, base, strict=True))
+        beyond = (point[0] - base[0], point[1] - base[1], point[2] - base[2])
         return *projected(rot.identity(focal), point, focal), *projected(rotation, beyond, focal)
 
     distances = jax.random.uniform(keys[4], (points,), float, *depth)

@@ -1,9 +1,9 @@
 """Pairs with known answers, and comparisons by geometry, shared by the tests."""
 
 import csv
+from functools import partial
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +11,13 @@ import oracles
 
 import jaxro
 from jaxro import DependentElements, IndependentElements, Pair, RelativePose, pair, simulation
+from jaxro.programs import QUICK
 
-orient = eqx.filter_jit(jaxro.orient)
+orient = jaxro.orient
 """Compiled once per element system, residual and shape for the whole run of tests."""
+
+jit = partial(jax.jit, compiler_options=QUICK)
+"""For large programs that run once."""
 
 SYSTEMS = (RelativePose, IndependentElements, DependentElements)
 

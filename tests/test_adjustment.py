@@ -8,7 +8,7 @@ import pytest
 
 import jaxro
 
-# Levelling net of four unknown heights over one datum point (0), seven observed differences [m] with their lengths [km].
+# Levelling net of four unknown heights over one datum point (0): seven observed differences [m], lengths [km].
 FROM = np.array([0, 1, 2, 3, 0, 4, 1])
 TO = np.array([1, 2, 3, 0, 4, 2, 3])
 RISE = np.array([1.245, 3.782, -2.161, -2.870, 4.101, 0.931, 1.617])
@@ -50,7 +50,8 @@ def test_levelling_net_equals_normal_equations():
 def test_derivatives_of_a_linear_net_are_its_generalised_inverse():
     forward = jax.jacfwd(lambda rise: net(rise).parameters)(jnp.asarray(RISE))
     reverse = jax.jacrev(lambda rise: net(rise).parameters)(jnp.asarray(RISE))
-    moved = np.stack([(net(jnp.asarray(RISE + d)).parameters - net(jnp.asarray(RISE - d)).parameters) / 2e-3 for d in 1e-3 * np.eye(7)], 1)
+    at = lambda step: net(jnp.asarray(RISE + step)).parameters
+    moved = np.stack([(at(d) - at(-d)) / 2e-3 for d in 1e-3 * np.eye(7)], axis=1)
     np.testing.assert_allclose(forward, moved, atol=1e-10)
     np.testing.assert_allclose(forward, reverse, atol=1e-13)
 

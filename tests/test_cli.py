@@ -71,7 +71,11 @@ def test_files_hold_the_python_result_to_the_bit(sample, tmp_path):
     for prefix, wanted in (("", values), ("sd_", deviations)):
         got = numbers(row, *(prefix + name for name in lengths + angles))
         np.testing.assert_allclose(got, [*wanted[:2], *(wanted[2:] * (180 / np.pi))], rtol=1e-15)
-    assert numbers(row, "sigma0_mm", "m_q_mm", "bx_mm") == [float(o.sigma0), float(o.m_q), float(np.mean(measured.coordinates[0] - measured.coordinates[2]))]
+    assert numbers(row, "sigma0_mm", "m_q_mm", "bx_mm") == [
+        float(o.sigma0),
+        float(o.m_q),
+        float(np.mean(measured.coordinates[0] - measured.coordinates[2])),
+    ]
     assert (row["result"], row["advice"], row["degrees_of_freedom"]) == ("successful", "", "1")
     residuals, points = rows(out / "residuals.csv"), rows(out / "points.csv")
     assert [r["point"] for r in residuals] == list("abcdef")

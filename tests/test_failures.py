@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import problems
 import pytest
 
 import jaxro
@@ -175,12 +176,12 @@ def test_a_failing_neighbour_changes_no_bit():
         jaxro.pair(good[0].x_left.at[0].set(jnp.nan), *good[0].coordinates[1:], focal=FOCAL),
         jaxro.pair(*np.random.default_rng(1).uniform(-90, 90, (4, 12)), focal=FOCAL),
     ]
-    program = jax.jit(jax.vmap(jaxro.orient))
+    program = problems.jit(jax.vmap(jaxro.orient))
     alone = program(jaxro.stack([*good, *good[:4]]))
     beside = program(jaxro.stack([*good, *bad]))
     for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(beside), strict=True):
         np.testing.assert_array_equal(np.asarray(a)[:6], np.asarray(b)[:6])
-    slope = jax.jit(jax.grad(lambda pairs: jnp.sum(jax.vmap(jaxro.orient)(pairs).pose.qx[:6]), allow_int=True))
+    slope = problems.jit(jax.grad(lambda pairs: jnp.sum(jax.vmap(jaxro.orient)(pairs).pose.qx[:6]), allow_int=True))
     np.testing.assert_array_equal(
         slope(jaxro.stack([*good, *good[:4]])).x_left[:6], slope(jaxro.stack([*good, *bad])).x_left[:6]
     )

@@ -9,14 +9,14 @@ from jaxtyping import Array, Bool, Float
 
 from .. import coplanarity
 from ..adjustment import Residuals
-from ..elements import RelativePose
+from ..elements import AbstractElements, RelativePose
 from ..pairs import Pair
 
 
 class Begin(NamedTuple):
     """A pose to begin with, whether another one fits the points as well, and whether a rotation alone explains them."""
 
-    pose: RelativePose
+    pose: AbstractElements
     ambiguous: Bool[Array, ""]
     pure_rotation: Bool[Array, ""]
 

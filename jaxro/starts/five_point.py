@@ -100,7 +100,7 @@ def _constraints(basis: Float[Array, "4 3 3 problem"]) -> Float[Array, "10 20 pr
     symmetric = symmetric - jnp.eye(3, dtype=basis.dtype)[None, :, :, None] * (trace / 2)[:, None, None]
     # term [square, letter]: (E Eᵀ - tr/2) E and row0 . (row1 x row2)
     parts = (symmetric[:, None, :, k, None] * basis[None, :, None, k] for k in range(3))
-    cubic = sum(parts).reshape(40, 9, -1)
+    cubic = jnp.asarray(sum(parts)).reshape(40, 9, -1)
     normal = (_cross(one[:, 1], two[:, 2], 1) + _cross(two[:, 1], one[:, 2], 1)) * half[:, 0]
     determinant = jnp.sum(normal[:, None] * basis[None, :, 0], axis=2).reshape(40, 1, -1)
     terms = jnp.concatenate([cubic, determinant], axis=1)
