@@ -163,9 +163,10 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
             longest = jnp.maximum(longest, jnp.abs(d))
         shrink = jnp.minimum(1.0, self.max_step / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny))
         moved = [x - shrink * d for x, d in zip(leaves, delta, strict=True)]
-        size = longest * 0
-        for x, d in zip(moved, delta, strict=True):
-            size = jnp.maximum(size, jnp.abs(d) / (self.atol + self.rtol * jnp.abs(x)))
+        largest = longest * 0
+        for x in moved:
+            largest = jnp.maximum(largest, jnp.abs(x))
+        size = longest / (self.atol + self.rtol * largest)
         previous = state[1]
         predicted = size * jnp.where(previous > 0, jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)), 1.0)
         return jax.tree.unflatten(structure, moved), (predicted, size), None

@@ -118,8 +118,10 @@ NEAR_STEPS = 10
 
 def orient_near(pair: Pair, *, start: starts.Auto, max_steps: int = 30, **options) -> tuple[Orientation, Array]:
     """The first part of an `Auto` start as an orientation of its own: from the vertical, and whether that fits."""
-    near = orient(pair, start=starts.Vertical(), max_steps=min(max_steps, NEAR_STEPS), **options)
-    return near, start.fits(cleaned(pair)[0], near.pose) & (near.result != RESULTS.diverged)
+    most = min(max_steps, NEAR_STEPS)
+    near = orient(pair, start=starts.Vertical(), max_steps=most, **options)
+    # asks for the count, not for the result, which would cost the statistics where only the pose is wanted
+    return near, start.fits(cleaned(pair)[0], near.pose) & ((near.iterations < most) | (max_steps <= NEAR_STEPS))
 
 
 def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_steps) -> Orientation:
