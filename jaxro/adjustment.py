@@ -20,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from . import normal_equations as normal
 from .elements import AbstractElements
 from .losses import AbstractLoss
+from .reductions import counts
 from .results import RESULTS
 
 Parameters = Any
@@ -68,13 +69,15 @@ def dimension(parameters: Parameters) -> int:
     return sum(jnp.size(leaf) for leaf in jax.tree.leaves(parameters))
 
 
-def whitened(condition: Callable, parameters: Parameters, observation: PyTree, cofactor: PyTree, use) -> list:
-    """The m entries of L⁻¹ g of one group, L Lᵀ = B Q Bᵀ; zero where the group is not used.
+def discrepancy(condition: Callable, parameters: Parameters, observation: PyTree, cofactor: PyTree, use):
+    """The m entries of g of one group, and the lower triangle of B Q Bᵀ (the unit matrix where it is not used).
 
-    Entries of the observation whose cofactor is None are free of error.
+    A cofactor stands for every entry of its part of the observation; entries whose cofactor is None are free of error.
     """
-    filled = jax.tree.map(lambda q, _: q is not None, cofactor, observation, is_leaf=lambda q: q is None)
-    measured, exact = eqx.partition(observation, filled)
+    known = jax.tree.map(
+        lambda q, part: jax.tree.map(lambda _: q is not None, part), cofactor, observation, is_leaf=_none
+    )
+    measured, exact = eqx.partition(observation, known)
 
     def values(measured):
         g = condition(parameters, eqx.combine(measured, exact))
@@ -82,17 +85,35 @@ def whitened(condition: Callable, parameters: Parameters, observation: PyTree, c
 
     g, pull = jax.vjp(values, measured)
     one, zero = jnp.ones_like(g[0]), jnp.zeros_like(g[0])
-    rows = [jax.tree.leaves(pull([one if j == k else zero for j in range(len(g))])[0]) for k in range(len(g))]
-    variances = jax.tree.leaves(cofactor)
-    weight = [
-        [sum(jnp.sum(q * a * b) for q, a, b in zip(variances, rows[i], rows[j], strict=True)) for j in range(i + 1)]
-        for i in range(len(g))
-    ]
+    rows = [pull([one if j == k else zero for j in range(len(g))])[0] for k in range(len(g))]
+
+    def product(a: PyTree, b: PyTree):
+        """a Q bᵀ; one product by a variance that several entries share."""
+        part = lambda q, x, y: None if q is None else q * _dot(x, y, jnp.shape(q))
+        return sum(jnp.sum(t) for t in jax.tree.leaves(jax.tree.map(part, cofactor, a, b, is_leaf=_none)))
+
+    d = [[product(rows[i], rows[j]) for j in range(i + 1)] for i in range(len(g))]
     for i in range(len(g)):  # a masked group must not divide by its own zero
-        weight[i][i] = jnp.where(use, weight[i][i], one)
+        d[i][i] = jnp.where(use, d[i][i], one)
+    return g, d
+
+
+def _none(leaf) -> bool:
+    return leaf is None
+
+
+def _dot(a: PyTree, b: PyTree, shape: tuple[int, ...]):
+    """Sum of the products of two trees of entries, each reduced to the shape of their cofactor."""
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return sum(x * y if jnp.shape(x) == shape else jnp.sum(x * y) for x, y in pairs)
+
+
+def whitened(g: list, d: list, use) -> list:
+    """The m entries of L⁻¹ g of one group, L Lᵀ = B Q Bᵀ; zero where the group is not used."""
+    zero = jnp.zeros_like(g[0])
     if len(g) == 1:
-        return [jnp.where(use, g[0] * jax.lax.rsqrt(weight[0][0]), zero)]
-    factor, _ = normal.cholesky(weight)
+        return [jnp.where(use, g[0] / jnp.sqrt(d[0][0]), zero)]
+    factor, _ = normal.cholesky(d)
     out: list = []
     for i, row in enumerate(factor):
         s = g[i]
@@ -106,8 +127,7 @@ class Residuals(eqx.Module):
     """The whitened residuals of all groups as a function of a displacement x of the parameters from `centre`.
 
     What the groups share is computed once by `prepare(parameters)`; its few numbers θ are what a group's condition
-    sees. A column of the Jacobian is then Σ_m (dr/dθ_m) (dθ_m/dx_k): the first factor by reverse mode for each group,
-    the second once for all of them.
+    sees.
     """
 
     prepare: Callable | None
@@ -118,45 +138,52 @@ class Residuals(eqx.Module):
     mask: Bool[Array, " group"]
     loss: AbstractLoss | None = None
 
-    def around(self, centre: Parameters) -> "Residuals":
-        """The same residuals without a loss, around other parameters."""
-        return Residuals(self.prepare, self.condition, centre, self.observations, self.cofactor, self.mask)
-
     def shared(self, *x: Array) -> PyTree:
-        """θ(x): what `prepare` makes of the parameters, or x itself."""
-        return x if self.prepare is None else jax.tree.map(jnp.asarray, self.prepare(moved(self.centre, x)))
+        """θ(x): what `prepare` makes of the parameters, or the parameters themselves."""
+        parameters = moved(self.centre, x)
+        return parameters if self.prepare is None else jax.tree.map(jnp.asarray, self.prepare(parameters))
 
-    def group(self, theta: PyTree, observation: PyTree, cofactor: PyTree, use) -> list:
+    def groups(self, function: Callable, theta: PyTree) -> Any:
+        """function(g, B Q Bᵀ, use) of every group."""
+        one = lambda l, q, use: function(*discrepancy(self.condition, theta, l, q, use), use)
+        return jax.vmap(one)(self.observations, self.cofactor, self.mask)
+
+    def residuals(self, g: list, d: list, use) -> list:
         """The m whitened (and, with a loss, transformed) residuals of one group."""
-        prepared = moved(self.centre, theta) if self.prepare is None else theta
-        r = whitened(self.condition, prepared, observation, cofactor, use)
+        r = whitened(g, d, use)
         return r if self.loss is None else [self.loss.transformed(entry) for entry in r]
 
     def __call__(self, x: tuple[Array, ...]) -> Float[Array, " group"] | Float[Array, "group m"]:
-        theta = self.shared(*x)
-        each = jax.vmap(lambda *one: self.group(theta, *one))
-        r = each(self.observations, self.cofactor, self.mask)
-        return r[0] if len(r) == 1 else jnp.stack(r, axis=1)
+        return together(self.groups(self.residuals, self.shared(*x)))
 
-    def columns(self, x: tuple[Array, ...]) -> tuple[list[Array], list[list[Array]]]:
-        """The m residual arrays, and for each parameter the m arrays of its column."""
-        theta = self.shared(*x)
+    def columns(self, x: tuple[Array, ...]) -> tuple[list[Array], list[list[Array]], list[Array] | None]:
+        """The m residual arrays, for each parameter the m arrays of its column, and the weights of both.
 
-        def one(*group):
-            r, pull = jax.vjp(lambda theta: self.group(theta, *group), theta)
-            unit = lambda c: [jnp.ones_like(entry) if k == c else jnp.zeros_like(entry) for k, entry in enumerate(r)]
-            return r, [pull(unit(c))[0] for c in range(len(r))]
+        A single condition stays unwhitened, residual g and weight 1/d, d = B Q Bᵀ: its column is √d times that of
+        g/√d, that is ∂g - g ∂d / 2d, and no root is taken. Otherwise the weight is None.
+        """
 
-        r, gradients = jax.vmap(one)(self.observations, self.cofactor, self.mask)
-        if self.prepare is None:
-            return r, [[gradient[k] for gradient in gradients] for k in range(len(x))]
-        jacobian = []
-        for k in range(len(x)):  # one parameter at a time: what it does not touch stays a symbolic zero
+        def entries(g, d, use):
+            single = len(g) == 1 and self.loss is None
+            return (g, d[0]) if single else (self.residuals(g, d, use), [])
+
+        slopes = []
+        for k, at in enumerate(x):  # one parameter at a time: what it does not touch stays a symbolic zero
             along = lambda t, k=k: self.shared(*x[:k], t, *x[k + 1 :])
-            _, slope = jax.jvp(along, (x[k],), (jnp.ones_like(x[k]),))
-            slope = jax.tree.leaves(slope)
-            jacobian.append([sum(d * s for d, s in zip(jax.tree.leaves(g), slope, strict=True)) for g in gradients])
-        return r, jacobian
+            theta, slope = jax.jvp(along, (at,), (jnp.ones_like(at),))
+            slopes.append(slope)
+        (g, d), push = jax.linearize(lambda theta: self.groups(entries, theta), theta)
+        pushed = [push(slope) for slope in slopes]
+        if not d:
+            return g, [column for column, _ in pushed], None
+        weight = jnp.where(self.mask, 1 / d[0], 0.0)
+        half = 0.5 * g[0] * weight
+        return g, [[dg[0] - half * dd[0]] for dg, dd in pushed], [weight]
+
+
+def together(entries: list) -> Float[Array, " group"] | Float[Array, "group m"]:
+    """The m arrays of all groups as one."""
+    return entries[0] if len(entries) == 1 else jnp.stack(entries, axis=1)
 
 
 def adjust(
@@ -174,8 +201,9 @@ def adjust(
     """Adjust parameters to measurements: Σ |L_i⁻¹ g(x, l_i)|² = min, or Σ rho of it with a robust loss.
 
     `condition(parameters, observation)` of one group returns a number or m of them. `observations`: a pytree whose
-    leaves have the groups on the first axis; `cofactor`: the same tree of variances (relative to sigma0²), numbers or
-    one per group, None for what is free of error. `mask` selects groups. `start`: elements, or any pytree of numbers.
+    leaves have the groups on the first axis; `cofactor`: its variances (relative to sigma0²), a tree that may end above
+    the leaves and then holds for all of them: numbers or one per group, None for what is free of error. `mask` selects
+    groups. `start`: elements, or any pytree of numbers.
     `prepare`: what all groups share, computed once; the condition then gets prepare(parameters) for the parameters.
     `solver`: any optimistix least-squares solver; `GaussNewton()` if None.
 
@@ -186,12 +214,8 @@ def adjust(
     groups = jax.tree.leaves(observations)[0].shape[0]
     if mask is None:
         mask = jnp.ones(groups, bool)
-    cofactor = jax.tree.map(
-        lambda q, l: None if q is None else jnp.broadcast_to(jnp.asarray(q, l.dtype), l.shape),
-        cofactor,
-        observations,
-        is_leaf=lambda q: q is None,
-    )
+    dtype = jax.tree.leaves(start)[0].dtype
+    cofactor = jax.tree.map(lambda q: jnp.broadcast_to(jnp.asarray(q, dtype), (groups, *jnp.shape(q)[1:])), cofactor)
     start = jax.lax.stop_gradient(start)
     residuals = residuals_of(condition, prepare, start, observations, cofactor, mask, loss)
     p = dimension(start)
@@ -231,8 +255,13 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
     """Everything that follows from the linearisation at the solution, the centre of `residuals`."""
     p = dimension(residuals.centre)
     zero = jnp.zeros((), jax.tree.leaves(residuals.centre)[0].dtype)
-    r, jacobian = residuals.columns((zero,) * p)
-    weight = None if loss is None else [loss.weight(entry * entry) for entry in r]
+    r, jacobian, weight = residuals.columns((zero,) * p)
+    whitened = r
+    if weight is not None:
+        whitened = [jnp.where(residuals.mask, entry * jnp.sqrt(w), 0.0) for entry, w in zip(r, weight, strict=True)]
+    if loss is not None:
+        robust = [loss.weight(entry * entry) for entry in whitened]
+        weight = robust if weight is None else [a * b for a, b in zip(robust, weight, strict=True)]
     n, _, squares = normal.accumulate(r, jacobian, weight)
     q, pivot = normal.inverse(n)
     redundancy = []
@@ -240,8 +269,8 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
         column = [jacobian[k][c] for k in range(p)]
         taken = sum((1.0 if i == j else 2.0) * q[i][j] * column[i] * column[j] for i in range(p) for j in range(i + 1))
         redundancy.append(jnp.where(residuals.mask, 1 - (taken if weight is None else weight[c] * taken), 0.0))
-    together = lambda a: a[0] if len(a) == 1 else jnp.stack(a, axis=1)
-    freedom = len(r) * jnp.sum(residuals.mask) - p
+    (groups,) = counts(residuals.mask)
+    freedom = len(r) * groups.astype(int) - p
     checked = freedom > 0
     variance = squares / jnp.where(checked, freedom, 1).astype(r[0].dtype)
     positive = variance > 0
@@ -252,7 +281,7 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
         residuals.centre,
         normal.dense(n),
         normal.dense(q),
-        together(r),
+        together(whitened),
         together(redundancy),
         jnp.where(checked, root, jnp.nan),
         pivot,

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from . import rotations as rot
 from .elements import AbstractElements, essential_matrix
@@ -36,7 +36,7 @@ class Adjusted(NamedTuple):
     prepare: Callable
     condition: Callable
     observations: tuple
-    cofactor: tuple
+    cofactor: PyTree
 
 
 def fundamental_matrix(elements: AbstractElements, focal_left: Scalar, focal_right: Scalar) -> Matrix:
@@ -84,7 +84,7 @@ def y_parallax(rows: tuple, point: Point, focal_left: Scalar, focal_right: Scala
 def rigorous(pair: Pair) -> Adjusted:
     """Adjust the four image coordinates of every point."""
     prepare = lambda elements: fundamental_matrix(elements, pair.focal_left, pair.focal_right)
-    return Adjusted(prepare, condition, pair.coordinates, (pair.sigma**2,) * 4)
+    return Adjusted(prepare, condition, pair.coordinates, pair.sigma**2)
 
 
 def parallax(pair: Pair) -> Adjusted:
@@ -99,7 +99,7 @@ def parallax(pair: Pair) -> Adjusted:
         point, measured = observation
         return y_parallax((left, right), point, *focals) - measured
 
-    return Adjusted(prepare, of_point, (pair.coordinates, jnp.zeros_like(pair.sigma)), ((None,) * 4, pair.sigma**2))
+    return Adjusted(prepare, of_point, (pair.coordinates, jnp.zeros_like(pair.sigma)), (None, pair.sigma**2))
 
 
 def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:
@@ -113,20 +113,28 @@ def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:
     return tuple(factor * entry for entry in gradient)  # pyright: ignore[reportReturnType]
 
 
-def intersection(
-    rotation: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar
-) -> tuple[Vector, Scalar, Scalar]:
-    """Model point halfway between the rays p1 and b + R p2 at their closest, and the depth factors λ, μ.
+def rays(left: Matrix | None, right: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar):
+    """The rays R1 p1 and R2 p2 (`left` None for R1 = 1), and w², λ w², μ w² of their closest points λ R1 p1 and
+    b + μ R2 p2:
 
-    With w = p1 x R p2: λ = ((b x R p2) . w) / w², μ = ((b x p1) . w) / w². Parallel rays give λ = μ = inf with the
-    sign of the side they would meet on.
+        w = R1 p1 x R2 p2,    λ w² = (b x R2 p2) . w,    μ w² = (b x R1 p1) . w
     """
     x1, y1, x2, y2 = point
-    first = (x1, y1, -focal_left)
-    second = rot.apply(rotation, (x2, y2, -focal_right))
+    first = (x1, y1, -focal_left) if left is None else rot.apply(left, (x1, y1, -focal_left))
+    second = rot.apply(right, (x2, y2, -focal_right))
     w = rot.cross(first, second)
-    squared = rot.dot(w, w)
-    lam = rot.dot(rot.cross(base, second), w) / squared
-    mu = rot.dot(rot.cross(base, first), w) / squared
+    lam, mu = (rot.dot(rot.cross(base, ray), w) for ray in (second, first))
+    return first, second, rot.dot(w, w), lam, mu
+
+
+def intersection(
+    left: Matrix | None, right: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar
+) -> tuple[Vector, Scalar, Scalar]:
+    """Model point halfway between the rays at their closest, and the depth factors λ, μ.
+
+    Parallel rays give λ = μ = inf with the sign of the side they would meet on.
+    """
+    first, second, squared, lam, mu = rays(left, right, base, point, focal_left, focal_right)
+    lam, mu = lam / squared, mu / squared
     half = tuple((lam * p + b + mu * s) / 2 for p, b, s in zip(first, base, second, strict=True))
     return half, lam, mu  # pyright: ignore[reportReturnType]

@@ -17,6 +17,9 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from .programs import stage
+from .reductions import sums
+
 Scalar = Float[Array, ""]
 Scalars = Sequence[Any]
 Columns = Sequence[Float[Array, " residual"]]
@@ -28,19 +31,6 @@ UNROLLED = 12
 
 SINGULAR = 1e-12
 """Relative pivot below which a parameter counts as undetermined by those before it."""
-
-
-@jax.custom_jvp
-def sums(arrays: tuple[Array, ...]) -> tuple[Scalar, ...]:
-    """The sums of equally long arrays, in one pass over all of them."""
-    zeros = tuple(jnp.zeros((), a.dtype) for a in arrays)
-    return tuple(lax.reduce(arrays, zeros, lambda p, q: tuple(a + b for a, b in zip(p, q, strict=True)), (0,)))
-
-
-@sums.defjvp
-def _sums_jvp(primals, tangents):
-    (arrays,), (moved,) = primals, tangents
-    return sums(arrays), tuple(jnp.sum(a) for a in moved)
 
 
 def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None):
@@ -58,11 +48,11 @@ def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None =
     return n, total[:p], total[p]
 
 
-def columns(residual: Callable, x: Scalars) -> tuple[Columns, list[Columns]]:
+def columns(residual: Callable, x: Scalars) -> tuple[Columns, list[Columns], None]:
     """Residuals r(x) and the columns dr/dx_k of any residual function, by linearising it once."""
     r, push = jax.linearize(lambda *y: residual(y), *x)
     unit = jnp.eye(len(x), dtype=r.dtype)
-    return [r], [[push(*(unit[k, i] for i in range(len(x))))] for k in range(len(x))]
+    return [r], [[push(*(unit[k, i] for i in range(len(x))))] for k in range(len(x))], None
 
 
 def cholesky(n: Lower) -> tuple[Lower, Scalar]:
@@ -115,7 +105,7 @@ def solve(n: Lower, h: Scalars) -> list[Scalar]:
     """N⁻¹ h."""
     if len(h) > UNROLLED:
         return list(jnp.linalg.solve(dense(n), jnp.stack(list(h))))
-    return substitute(cholesky(n)[0], h)
+    return stage(lambda n, h: substitute(cholesky(n)[0], h))(n, h)
 
 
 def inverse(n: Lower) -> tuple[Lower, Scalar]:
@@ -126,7 +116,12 @@ def inverse(n: Lower) -> tuple[Lower, Scalar]:
         scaled = dense(n) * scale[:, None] * scale[None, :]
         full = jnp.linalg.inv(scaled) * scale[:, None] * scale[None, :]
         return [[full[i, j] for j in range(i + 1)] for i in range(p)], jnp.min(jnp.linalg.eigvalsh(scaled))
-    factor, pivot = lax.optimization_barrier(cholesky(n))  # else XLA expands it into every entry of the inverse
+    return stage(_unrolled_inverse)(n)
+
+
+def _unrolled_inverse(n: Lower) -> tuple[Lower, Scalar]:
+    p = len(n)
+    factor, pivot = cholesky(n)
     zero, one = jnp.zeros_like(n[0][0]), jnp.ones_like(n[0][0])
     solved = [substitute(factor, [one if i == k else zero for i in range(p)]) for k in range(p)]
     return [[solved[j][i] for j in range(i + 1)] for i in range(p)], pivot
@@ -153,10 +148,12 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state, tags):
         leaves, structure = jax.tree.flatten(y)
         if hasattr(args, "columns"):
-            r, jacobian = args.columns(tuple(leaves))
+            r, jacobian, weight = args.columns(tuple(leaves))
         else:
-            r, jacobian = columns(lambda x: ravel_pytree(fn(jax.tree.unflatten(structure, x), args)[0])[0], leaves)
-        n, h, _ = accumulate(r, jacobian)
+            r, jacobian, weight = columns(
+                lambda x: ravel_pytree(fn(jax.tree.unflatten(structure, x), args)[0])[0], leaves
+            )
+        n, h, _ = accumulate(r, jacobian, weight)
         delta = solve(n, h)
         longest = delta[0] * 0
         for d in delta:

@@ -1,5 +1,6 @@
 """Relative orientation of one measured stereo pair: the one call of the README."""
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -15,7 +16,8 @@ from .elements import AbstractElements, DependentElements, IndependentElements, 
 from .losses import AbstractLoss
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned
-from .programs import QUICK, Program, traced
+from .programs import QUICK, Program, stage, traced
+from .reductions import counts, sums, total
 from .results import RESULTS, is_usable
 
 WEAK = 0.04
@@ -107,8 +109,9 @@ def orient(
     run = lambda function, start: Program(function, options | {"start": start}, QUICK)(pair)
     if not isinstance(start, starts.Auto):
         return run(_orient, start)
-    # Two small programs instead of one large: the general start is compiled when a pair first needs it.
-    orientation, fits = run(orient_near, start)
+    # Two small programs instead of one large: the general start is compiled when a pair first needs it. One pair alone
+    # gains nothing from steps in single precision.
+    orientation, fits = run(orient_near, dataclasses.replace(start, steps=0))
     return orientation if bool(fits) else run(_orient, start.general)
 
 
@@ -119,7 +122,7 @@ NEAR_STEPS = 10
 def orient_near(pair: Pair, *, start: starts.Auto, max_steps: int = 30, **options) -> tuple[Orientation, Array]:
     """The first part of an `Auto` start as an orientation of its own: from the vertical, and whether that fits."""
     most = min(max_steps, NEAR_STEPS)
-    near = orient(pair, start=starts.Vertical(), max_steps=most, **options)
+    near = orient(pair, start=starts.Vertical(start.steps), max_steps=most, **options)
     # asks for the count, not for the result, which would cost the statistics where only the pose is wanted
     return near, start.fits(cleaned(pair)[0], near.pose) & ((near.iterations < most) | (max_steps <= NEAR_STEPS))
 
@@ -145,14 +148,16 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     )
     solved = adjustment.parameters
     pose, flipped = _facing(to_pose(solved), pair, isinstance(solved, RelativePose))
-    # The barriers keep XLA from expanding these few numbers again into every result that uses them.
-    pose, flipped, solved = lax.optimization_barrier((pose, flipped, solved))
     length = _length(pair, elements, base, pose)
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
-    f = coplanarity.fundamental_matrix(pose, pair.focal_left, pair.focal_right)
-    frames = tuple(frame[1:] for frame in coplanarity.turned(pose))
-    f, frames, chosen, q = lax.optimization_barrier((f, frames, chosen, q))
+    derived = stage(
+        lambda pose, left, right: (
+            coplanarity.fundamental_matrix(pose, left, right),
+            tuple(frame[1:] for frame in coplanarity.turned(pose)),
+        )
+    )
+    f, frames = derived(pose, pair.focal_left, pair.focal_right)
     each = lambda function: jax.vmap(function)(pair.coordinates, pair.mask)
     v = each(lambda point, use: coplanarity.corrections(f, point, use))
     parallax = each(
@@ -160,21 +165,22 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     )
     corrected = tuple(c + dv for c, dv in zip(pair.coordinates, v, strict=True))
     scale = _scale(chosen, pose, length)
-    model, in_front, far = _model(pair, pose, corrected, rot.scaled_rows(chosen.model_frame(), scale))
+    model, in_front, far = _model(pair, pose, corrected, chosen.model_frame(), scale)
 
     freedom = adjustment.degrees_of_freedom
     checked = freedom > 0
-    qq = jnp.sum(parallax**2) / jnp.where(checked, freedom, 1).astype(parallax.dtype)
+    qq = total(parallax**2) / jnp.where(checked, freedom, 1).astype(parallax.dtype)
     m_q = jnp.where(checked, jnp.where(qq > 0, jnp.sqrt(jnp.where(qq > 0, qq, 1.0)), 0.0), jnp.nan)
 
     result = adjustment.result
     fair = result == RESULTS.successful
+    (behind,) = counts(pair.mask & ~in_front & ~far)
     noise = jnp.where(checked, adjustment.sigma0, 0.0)
     worst = jnp.max(jnp.diagonal(adjustment.cofactor))
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous, RESULTS.two_solutions),
-        (jnp.any(pair.mask & ~in_front & ~far), RESULTS.points_behind_camera),
+        (behind > 0, RESULTS.points_behind_camera),
         (_undefined(elements, pose), RESULTS.elements_undefined),
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
         (noise**2 * worst > WEAK**2, RESULTS.weakly_determined),
@@ -208,11 +214,12 @@ def _facing(pose: RelativePose, pair: Pair, free: bool) -> tuple[RelativePose, B
         return pose, jnp.zeros_like(pose.qw, bool)
     rotation, base = pose.relative()
 
-    def side(point, use):
-        _, lam, mu = coplanarity.intersection(rotation, base, point, pair.focal_left, pair.focal_right)
-        return jnp.where(use, jnp.sign(lam) + jnp.sign(mu), 0.0)
+    def sides(point, use):
+        *_, lam, mu = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
+        return tuple(jnp.where(use, jnp.where(depth > 0, 1.0, -1.0), 0.0) for depth in (lam, mu))
 
-    turn = jnp.sum(jax.vmap(side)(pair.coordinates, pair.mask)) < 0
+    left, right = sums(jax.vmap(sides)(pair.coordinates, pair.mask))
+    turn = left + right < 0
     sign = jnp.where(turn, -1.0, 1.0)
     return RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *rot.scaled(base, sign)), turn
 
@@ -256,35 +263,36 @@ def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractEl
     return at(origin), jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
 
 
-def _model(pair: Pair, pose: RelativePose, corrected: Coordinates, frame: rot.Matrix) -> tuple:
+def _model(pair: Pair, pose: RelativePose, corrected: Coordinates, frame: rot.Matrix, scale) -> tuple:
     """Model points of the corrected coordinates, which of them lie in front, and which are infinitely far."""
     rotation, base = pose.relative()
+    right, base = rot.product(frame, rotation), rot.scaled(rot.apply(frame, base), scale)
 
     def one(point, use):
-        half, lam, mu = coplanarity.intersection(rotation, base, point, pair.focal_left, pair.focal_right)
+        model, lam, mu = coplanarity.intersection(frame, right, base, point, pair.focal_left, pair.focal_right)
+        lam, mu = lam / scale, mu / scale
         near = jnp.minimum(jnp.abs(lam) * pair.focal_left, jnp.abs(mu) * pair.focal_right)
         far = ~(near * AT_INFINITY < 1)
-        x, y, z = rot.apply(frame, half)
-        keep = use & jnp.isfinite(x) & jnp.isfinite(y) & jnp.isfinite(z)
-        return tuple(jnp.where(keep, c, 0.0) for c in (x, y, z)), use & (lam > 0) & (mu > 0), use & far
+        keep = use & jnp.isfinite(lam) & jnp.isfinite(mu)
+        return tuple(jnp.where(keep, c, 0.0) for c in model), use & (lam > 0) & (mu > 0), use & far
 
     return jax.vmap(one)(corrected, pair.mask)
 
 
 def _pure_rotation(pair: Pair, pose: RelativePose, noise) -> Bool[Array, ""]:
     """Whether the directions p1 and R p2 agree to within the measuring error: no parallax, hence no base."""
-    rotation, _ = pose.relative()
+    rotation, base = pose.relative()
 
-    def one(x1, y1, x2, y2, sigma, use):
-        first = rot.unit((x1, y1, -pair.focal_left))
-        second = rot.unit(rot.apply(rotation, (x2, y2, -pair.focal_right)))
-        chord = rot.dot(rot.cross(first, second), rot.cross(first, second))
-        return jnp.where(use, chord * (pair.focal_left / sigma) ** 2, 0.0), jnp.where(use, 1 / sigma**2, 0.0)
+    def one(point, sigma, use):
+        first, second, w2, *_ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
+        sine2 = w2 / (rot.dot(first, first) * rot.dot(second, second))
+        weight = (pair.focal_left / sigma) ** 2
+        return jnp.where(use, sine2 * weight, 0.0), jnp.where(use, weight, 0.0)
 
-    squared, weight = jax.vmap(one)(*pair.coordinates, pair.sigma, pair.mask)
+    squared, weight = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
     count = jnp.maximum(pair.count, 1.0)
-    rounding = 1e-9 * pair.focal_left * jnp.sqrt(jnp.sum(weight) / count)
-    return jnp.sqrt(jnp.sum(squared) / count) < starts.significant(pair.count - 5) * noise + rounding
+    limit = starts.significant(pair.count - 5) * noise + 1e-9 * jnp.sqrt(weight / count)
+    return jnp.sqrt(squared / count) < limit
 
 
 def _undefined(system: type[AbstractElements], pose: RelativePose) -> Bool[Array, ""]:

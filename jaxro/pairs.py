@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from .reductions import counts, total
+
 Coordinates = tuple[Float[Array, "*pairs point"], ...]
 """x_left, y_left, x_right, y_right"""
 
@@ -72,7 +74,7 @@ class Pair(eqx.Module):
     @property
     def count(self) -> Float[Array, "*pairs"]:
         """Number of points that take part, as a float."""
-        return jnp.sum(self.mask, axis=-1, dtype=self.x_left.dtype)
+        return total(self.mask.astype(self.x_left.dtype))
 
     def with_mask(self, mask: Bool[Array, "*pairs point"]) -> "Pair":
         """The same pair with other points taking part."""
@@ -173,7 +175,8 @@ def cleaned(one: Pair) -> tuple[Pair, Bool[Array, "*pairs"]]:
     use = one.mask & finite
     focals = [one.focal_left, one.focal_right]
     focal_ok = [jnp.isfinite(f) & (f > 0) for f in focals]
-    bad = jnp.any(one.mask & ~finite, axis=-1) | ~focal_ok[0] | ~focal_ok[1]
+    (left_out,) = counts(one.mask & ~finite)
+    bad = (left_out > 0) | ~focal_ok[0] | ~focal_ok[1]
     repaired = Pair(
         *(jnp.where(use, c, 0.0) for c in one.coordinates),
         jnp.where(use, one.sigma, 1.0),

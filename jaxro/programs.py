@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 from jax.core import Tracer
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import PyTree
 
 FAST = {
@@ -54,11 +55,21 @@ class Program:
     def __call__(self, data: PyTree) -> PyTree:
         return _compiled(self._function, self._static, self._settings)(data, self._arrays)
 
+    @property
+    def outputs(self) -> dict[Any, PyTree]:
+        """Room for a caller to keep the shapes of its results, as long as the compiled program lives."""
+        return _outputs(self._function, self._static, self._settings)
+
 
 @lru_cache(maxsize=64)
 def _compiled(function: Callable, static: _Key, settings: tuple) -> Callable:
     known = _known(settings) if jax.default_backend() == "cpu" else None
     return jax.jit(lambda data, arrays: function(data, **eqx.combine(arrays, static.tree)), compiler_options=known)
+
+
+@lru_cache(maxsize=64)
+def _outputs(function: Callable, static: _Key, settings: tuple) -> dict[Any, PyTree]:
+    return {}
 
 
 @lru_cache
@@ -69,6 +80,24 @@ def _known(settings: tuple) -> dict[str, Any] | None:
     except jax.errors.JaxRuntimeError:
         return None
     return dict(settings)
+
+
+def stage(function: Callable) -> Callable:
+    """The function as one piece of code of its own in the compiled program, so that its results exist once.
+
+    XLA's CPU backend fuses a small computation into every consumer and repeats it there (an `optimization_barrier` is
+    gone before it does), and starts every small result by itself. For element-wise algebra only: library calls cannot
+    be made from such a piece. Other backends see the plain function.
+    """
+    if jax.default_backend() != "cpu":
+        return function
+    compiled = jax.jit(lambda *arguments: function(*arguments))
+
+    def call(*arguments):
+        with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
+            return compiled(*arguments)
+
+    return call
 
 
 def traced(tree: PyTree) -> bool:

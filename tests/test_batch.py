@@ -64,6 +64,15 @@ def test_no_lapack_in_the_batch_path(pairs):
         assert "while" in text and not re.search(r"= \S+ (cholesky|triangular-solve)\(", text)
 
 
+def test_the_general_start_runs_only_where_a_pair_needs_it(pairs):
+    """XLA must not move it before the loop that is to skip it (then near-vertical pairs take four hundred times as
+    long)."""
+    text = problems.jit(jax.vmap(jaxro.orient)).lower(pairs).compile().as_text()
+    always = text[text.index("\nENTRY") :]
+    assert "/general/" in text
+    assert not re.findall(r" (?:while|call|reduce|dot)\(.*/general/.*", always)
+
+
 def test_batches_from_two_threads_at_once(pairs):
     expected = jaxro.orient_batch(pairs, threads=1).pose.base
     with ThreadPoolExecutor(2) as pool:

@@ -6,9 +6,8 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from ..elements import RelativePose, vertical
-from ..normal_equations import steps
-from ..pairs import Pair
-from .base import AbstractStart, Begin, distances, rms_distance
+from ..pairs import Pair, cleaned
+from .base import AbstractStart, Begin, approached, rms_distance
 from .general import General
 
 
@@ -33,19 +32,20 @@ class Auto(AbstractStart):
         return (longest < self.tilt) & (rms_distance(pair, pose) < self.tolerance)
 
     def __call__(self, pair: Pair) -> Begin:
-        zero = jnp.zeros_like(pair.focal_left)
-        pose = vertical(pair.focal_left)
-        near = pose.moved(steps(distances(pair, pose), (zero,) * 5, self.steps, 0.5)).normalised()
+        near = approached(pair, vertical(pair.focal_left), self.steps)
         fits = self.fits(pair, near)
 
         # A loop of at most one round: under vmap it is entered only if some pair of the batch needs it, where a
-        # `cond` would be turned into a `select` and always compute the general start of every pair.
+        # `cond` would be turned into a `select` and always compute the general start of every pair. The points depend
+        # on the round, without which XLA would compute the general start before the loop, needed or not.
         def needed(state):
             return state[0]
 
         def general(state) -> tuple[Array, Begin]:
             pick = lambda new, old: jnp.where(state[0], new, old)
-            return jnp.zeros_like(state[0]), jax.tree.map(pick, self.general(pair), state[1])
+            with jax.named_scope("general"):
+                found = self.general(cleaned(pair.with_mask(pair.mask & state[0]))[0])
+            return jnp.zeros_like(state[0]), jax.tree.map(pick, found, state[1])
 
         no = jnp.zeros_like(fits)
         return lax.while_loop(needed, general, (~fits, Begin(near, no, no)))[1]
