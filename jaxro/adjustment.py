@@ -160,25 +160,27 @@ class Residuals(eqx.Module):
         """The m residual arrays, for each parameter the m arrays of its column, and the weights of both.
 
         A single condition stays unwhitened, residual g and weight 1/d, d = B Q Bᵀ: its column is √d times that of
-        g/√d, that is ∂g - g ∂d / 2d, and no root is taken. Otherwise the weight is None.
+        g/√d, that is ∂g - g ∂d / 2d, and no root is taken. A loss enters as the weight rho'(r²): steps are those of
+        iteratively reweighted least squares, which do not overshoot as those of the transformed residual may.
         """
 
         def entries(g, d, use):
-            single = len(g) == 1 and self.loss is None
-            return (g, d[0]) if single else (self.residuals(g, d, use), [])
+            return (g, d[0]) if len(g) == 1 else (whitened(g, d, use), [])
 
         slopes = []
         for k, at in enumerate(x):  # one parameter at a time: what it does not touch stays a symbolic zero
             along = lambda t, k=k: self.shared(*x[:k], t, *x[k + 1 :])
             theta, slope = jax.jvp(along, (at,), (jnp.ones_like(at),))
             slopes.append(slope)
-        (g, d), push = jax.linearize(lambda theta: self.groups(entries, theta), theta)
+        (r, d), push = jax.linearize(lambda theta: self.groups(entries, theta), theta)
         pushed = [push(slope) for slope in slopes]
         if not d:
-            return g, [column for column, _ in pushed], None
+            robust = None if self.loss is None else [self.loss.weight(entry**2) for entry in r]
+            return r, [column for column, _ in pushed], robust
         weight = jnp.where(self.mask, 1 / d[0], 0.0)
-        half = 0.5 * g[0] * weight
-        return g, [[dg[0] - half * dd[0]] for dg, dd in pushed], [weight]
+        half = 0.5 * r[0] * weight
+        jacobian = [[dr[0] - half * dd[0]] for dr, dd in pushed]
+        return r, jacobian, [weight if self.loss is None else weight * self.loss.weight(r[0] ** 2 * weight)]
 
 
 def together(entries: list) -> Float[Array, " group"] | Float[Array, "group m"]:

@@ -10,7 +10,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from . import coplanarity, rotations as rot, starts
+from . import coplanarity, degeneracy, rotations as rot, starts
 from .adjustment import adjust
 from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
 from .losses import AbstractLoss
@@ -88,14 +88,15 @@ def orient(
     loss: AbstractLoss | None = None,
     start: starts.AbstractStart | AbstractElements = starts.Auto(),  # noqa: B008 (frozen)
     solver: optx.AbstractLeastSquaresSolver | None = None,
-    max_steps: int = 30,
+    max_steps: int | None = None,
 ) -> Orientation:
     """Orient the right photo of a pair to the left one by least squares (or a robust loss).
 
     `elements`: the system of the result. `base`: bx of `DependentElements` (its sign says on which side the right photo
     lies), b of `IndependentElements`; the mean x-parallax if not given. `RelativePose` has a unit base. `residual`:
     `coplanarity.rigorous` or `coplanarity.parallax`. `start`: an object of `starts`, or known elements, which are then
-    also the parameters that are iterated. Works under jit, vmap and grad; failures are values of `result`.
+    also the parameters that are iterated. `max_steps`: 30 if not given, 300 with a loss, whose reweighted steps
+    converge linearly. Works under jit, vmap and grad; failures are values of `result`.
     """
     if pair.x_left.ndim != 1:
         raise ValueError(
@@ -103,6 +104,7 @@ def orient(
             "use jax.vmap(orient), or orient_batch"
         )
     base = None if base is None else jnp.asarray(base, pair.x_left.dtype)
+    max_steps = _most(max_steps, loss)
     options = dict(elements=elements, base=base, residual=residual, loss=loss, solver=solver, max_steps=max_steps)
     if traced((pair, base, start)):
         return _orient(pair, start=start, **options)
@@ -116,15 +118,22 @@ def orient(
 
 
 NEAR_STEPS = 10
-"""Steps allowed from the vertical: near-vertical photos take four or five."""
+"""Steps allowed from the vertical without a loss: near-vertical photos take four or five."""
 
 
-def orient_near(pair: Pair, *, start: starts.Auto, max_steps: int = 30, **options) -> tuple[Orientation, Array]:
+def _most(max_steps: int | None, loss: AbstractLoss | None) -> int:
+    return max_steps if max_steps is not None else 30 if loss is None else 300
+
+
+def orient_near(
+    pair: Pair, *, start: starts.Auto, loss: AbstractLoss | None = None, max_steps: int | None = None, **options
+) -> tuple[Orientation, Array]:
     """The first part of an `Auto` start as an orientation of its own: from the vertical, and whether that fits."""
-    most = min(max_steps, NEAR_STEPS)
-    near = orient(pair, start=starts.Vertical(start.steps), max_steps=most, **options)
+    max_steps = _most(max_steps, loss)
+    most = min(max_steps, NEAR_STEPS) if loss is None else max_steps
+    near = orient(pair, start=starts.Vertical(start.steps), loss=loss, max_steps=most, **options)
     # asks for the count, not for the result, which would cost the statistics where only the pose is wanted
-    return near, start.fits(cleaned(pair)[0], near.pose) & ((near.iterations < most) | (max_steps <= NEAR_STEPS))
+    return near, start.fits(cleaned(pair)[0], near.pose) & ((near.iterations < most) | (most == max_steps))
 
 
 def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_steps) -> Orientation:
@@ -176,17 +185,19 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     fair = result == RESULTS.successful
     (behind,) = counts(pair.mask & ~in_front & ~far)
     noise = jnp.where(checked, adjustment.sigma0, 0.0)
-    worst = jnp.max(jnp.diagonal(adjustment.cofactor))
+    worst = jnp.max(jnp.diagonal(degeneracy.in_radians(solved, adjustment.cofactor)[0]))
+    margin = degeneracy.margin(pair, solved, adjustment.cofactor)
+    needed = degeneracy.required(freedom.astype(margin.dtype))
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous, RESULTS.two_solutions),
         (behind > 0, RESULTS.points_behind_camera),
         (_undefined(elements, pose), RESULTS.elements_undefined),
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
-        (noise**2 * worst > WEAK**2, RESULTS.weakly_determined),
+        ((noise**2 * worst > WEAK**2) | (margin < needed * noise), RESULTS.weakly_determined),
     ):
         result = RESULTS.where(fair & condition_holds, code, result)
-    rotated = _pure_rotation(pair, pose, noise) | begin.pure_rotation
+    rotated = degeneracy.pure_rotation(pair, pose, noise) | begin.pure_rotation
     result = RESULTS.where(rotated, RESULTS.zero_base, result)
     result = RESULTS.where(freedom < 0, RESULTS.too_few_points, result)
     result = RESULTS.where(bad_input, RESULTS.non_finite_input, result)
@@ -277,22 +288,6 @@ def _model(pair: Pair, pose: RelativePose, corrected: Coordinates, frame: rot.Ma
         return tuple(jnp.where(keep, c, 0.0) for c in model), use & (lam > 0) & (mu > 0), use & far
 
     return jax.vmap(one)(corrected, pair.mask)
-
-
-def _pure_rotation(pair: Pair, pose: RelativePose, noise) -> Bool[Array, ""]:
-    """Whether the directions p1 and R p2 agree to within the measuring error: no parallax, hence no base."""
-    rotation, base = pose.relative()
-
-    def one(point, sigma, use):
-        first, second, w2, *_ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
-        sine2 = w2 / (rot.dot(first, first) * rot.dot(second, second))
-        weight = (pair.focal_left / sigma) ** 2
-        return jnp.where(use, sine2 * weight, 0.0), jnp.where(use, weight, 0.0)
-
-    squared, weight = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
-    count = jnp.maximum(pair.count, 1.0)
-    limit = starts.significant(pair.count - 5) * noise + 1e-9 * jnp.sqrt(weight / count)
-    return jnp.sqrt(squared / count) < limit
 
 
 def _undefined(system: type[AbstractElements], pose: RelativePose) -> Bool[Array, ""]:

@@ -31,8 +31,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "Add points in the empty zones."
     )
     weakly_determined = (
-        "The elements follow from the points only with a standard deviation above 0.04 rad (2°): the layout is too "
-        "small or too one-sided for its accuracy. Add points far from the present ones."
+        "For its errors the layout determines the elements too weakly: one of them has a standard deviation above 0.04 "
+        "rad (2°), or moving the points by some 30 sigma0 would leave one undetermined (points near a line, in one "
+        "zone, or a needed zone empty). Add points far from the present ones, or look for gross errors if sigma0 is "
+        "larger than you measure."
     )
     zero_base = (
         "The photos are explained by a pure rotation: the base is zero (or every point is far away), so neither base "

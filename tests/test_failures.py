@@ -7,7 +7,7 @@ import problems
 import pytest
 
 import jaxro
-from jaxro import RESULTS, DependentElements, IndependentElements, RelativePose, simulation
+from jaxro import RESULTS, DependentElements, IndependentElements, RelativePose, degeneracy, simulation
 
 FOCAL = 150.0
 
@@ -73,6 +73,50 @@ def test_layouts_that_do_not_determine_the_elements(points, sigma):
     if name(found) == "two_solutions":
         pytest.fail("an undetermined layout was called merely ambiguous")
     assert not bool(found.usable)
+
+
+LINE = np.column_stack([np.linspace(0, 1, 9), np.linspace(-0.5, 0.5, 9), -np.full(9, 2.0)])
+FOUR_ZONES = np.repeat([[0, 0, -1.0], [1, 0, -1], [0, 1, -1], [0, -1, -1]], 2, axis=0)
+TRIED = 400
+
+
+def rate(make):
+    """Share of noisy pairs of one kind that are called usable."""
+    pairs = jaxro.stack([jaxro.pad(make(seed), 12) for seed in range(5000, 5000 + TRIED)])
+    return np.mean(jaxro.orient_batch(pairs).usable)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda seed: photographed(LINE, sigma=0.005, seed=seed),
+        lambda seed: photographed(FOUR_ZONES, sigma=0.005, seed=seed),
+        lambda seed: photographed(np.repeat(block(4, seed=seed), 3, axis=0), sigma=0.005, seed=seed),
+        lambda seed: photographed(block(8, seed=seed), turn=(0.4, -0.5, 2.0), base=(0, 0, 0), sigma=0.01, seed=seed),
+        lambda seed: photographed(
+            block(12, seed=seed), turn=(0.02, -0.03, 0.05), base=(0, 0, 0), sigma=0.01, seed=seed
+        ),
+    ],
+    ids=["on a line", "two zones empty", "four points thrice", "no base, turned", "no base"],
+)
+def test_measuring_errors_do_not_hide_that_nothing_is_determined(make):
+    """Seeds that no threshold has seen; at most one in a hundred may pass."""
+    assert rate(make) <= 0.01
+
+
+@pytest.mark.parametrize("turn", [(0.02, -0.03, 0.05), (0.1, -0.2, 0.9)])
+@pytest.mark.parametrize("count", [8, 12])
+def test_sound_layouts_are_not_refused(turn, count):
+    assert rate(lambda seed: photographed(block(count, seed=seed), turn=turn, sigma=0.01, seed=seed)) >= 0.99
+
+
+@pytest.mark.parametrize("sigma", [0.001, 0.01])
+def test_margin_of_an_undetermined_layout_is_its_measuring_error(sigma):
+    """Every zone measured twice, two zones empty: what determines the elements is the error of the points alone."""
+    noisy = jaxro.stack([photographed(FOUR_ZONES, sigma=sigma, seed=seed) for seed in range(100)])
+    found = jaxro.orient_batch(noisy)
+    margins = jax.jit(jax.vmap(degeneracy.margin))(noisy, found.pose, found.cofactor)
+    assert 0.5 < np.median(margins) / sigma < 1.5
 
 
 def test_one_zone_only_is_weak():

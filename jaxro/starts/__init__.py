@@ -10,6 +10,6 @@ Known elements are a start, too: pass them instead.
 """
 
 from .auto import Auto as Auto
-from .base import AbstractStart as AbstractStart, Begin as Begin, significant as significant
+from .base import AbstractStart as AbstractStart, Begin as Begin
 from .general import General as General
 from .vertical import Vertical as Vertical

@@ -62,9 +62,3 @@ def approached(pair: Pair, pose: RelativePose, count: int) -> RelativePose:
 def _with_dtype(dtype, tree: PyTree) -> PyTree:
     """The tree with its floating-point numbers in another precision."""
     return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, tree)
-
-
-def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:
-    """Multiple of sigma0 below which parallaxes are explained by a rotation alone: 4, and more where sigma0 itself is
-    uncertain, having few degrees of freedom."""
-    return 4 + 12 / jnp.maximum(freedom, 1.0)

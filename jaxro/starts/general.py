@@ -12,10 +12,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .. import rotations as rot
+from ..degeneracy import significant
 from ..elements import RelativePose, vertical
 from ..normal_equations import steps
 from ..pairs import Pair
-from .base import AbstractStart, Begin, distances, rms_distance, significant
+from .base import AbstractStart, Begin, distances, rms_distance
 from .decomposition import best_pose, cheirality
 from .eight_point import eight_point
 from .five_point import five_point

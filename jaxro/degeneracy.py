@@ -1,0 +1,102 @@
+"""How near a layout of points is to one that does not determine the orientation, in units of its measuring errors.
+
+Measuring errors hide that elements are undetermined: points that lie on a line but for their errors give a regular
+normal matrix. Whether it means anything is a question of scale, and the scale is sigma0.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from . import coplanarity, rotations as rot
+from .elements import AbstractElements, RelativePose
+from .pairs import Pair
+from .programs import stage
+from .reductions import sums
+
+POWERS = 4
+"""Of the cofactor matrix: enough to separate its largest eigenvalue where that matters."""
+
+
+def in_radians(elements: AbstractElements, cofactor: Float[Array, "5 5"]) -> tuple[Float[Array, "5 5"], list]:
+    """The cofactors with components of the base over its length, and what each element was divided by."""
+    _, base = elements.relative()
+    length = jnp.sqrt(rot.dot(base, base))
+    units = [jnp.ones_like(length) if angle else length for angle in elements.angles]
+    scale = jnp.stack(units)
+    return cofactor / (scale[:, None] * scale[None, :]), units
+
+
+def margin(pair: Pair, elements: AbstractElements, cofactor: Float[Array, "5 5"]) -> Float[Array, ""]:
+    """The least change of the coordinates (root mean square over the points, in units of sigma) that leaves one
+    combination of the elements undetermined, to first order.
+
+    Along the worst determined direction e of the elements g of a point changes by g'. With n points the normal matrix
+    has eᵀ N e = Σ (g'/ (sigma |∇g|))², and each coordinate moves g' by ∇g', so that errors of size m alone produce
+    m² Σ (|∇g'| / |∇g|)²: the two are equal at m = margin.
+    """
+    cofactor, units = in_radians(elements, cofactor)
+    direction = stage(_worst)([[cofactor[i, j] for j in range(5)] for i in range(5)])
+    direction = [e * unit for e, unit in zip(direction, units, strict=True)]
+
+    def fundamental(t):
+        moved = elements.moved(tuple(t * e for e in direction))
+        return coplanarity.fundamental_matrix(moved, pair.focal_left, pair.focal_right)
+
+    zero = jnp.zeros_like(pair.focal_left)
+    f, slope = jax.jvp(fundamental, (zero,), (jnp.ones_like(zero),))
+    gradient = jax.grad(coplanarity.condition, argnums=1)
+
+    def one(point, sigma, use):
+        square = sum(entry**2 for entry in gradient(f, point))
+        square = jnp.where(use, square, 1.0)
+        change = coplanarity.condition(slope, point) ** 2 / (square * sigma**2)
+        drift = sum(entry**2 for entry in gradient(slope, point)) / square
+        return jnp.where(use, change, 0.0), jnp.where(use, drift, 0.0)
+
+    change, drift = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
+    ratio = change / jnp.where(drift > 0, drift, 1.0)
+    return jnp.where(drift > 0, jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0)), jnp.inf)
+
+
+def _worst(q: list) -> list:
+    """The eigenvector of the largest eigenvalue of a cofactor matrix, of any length: powers on a column."""
+    n = range(len(q))
+    trace = sum(q[i][i] for i in n)
+    q = [[entry / trace for entry in row] for row in q]
+    column, most = q[0], q[0][0]
+    for k in n[1:]:
+        longer = q[k][k] > most
+        column = [jnp.where(longer, a, b) for a, b in zip(q[k], column, strict=True)]
+        most = jnp.where(longer, q[k][k], most)
+    for _ in range(POWERS):
+        column = [sum(q[i][k] * column[k] for k in n) for i in n]
+    return column
+
+
+def required(freedom: Float[Array, ""]) -> Float[Array, ""]:
+    """Multiple of sigma0 below which a `margin` is not told from measuring errors: 30, and more where sigma0 itself is
+    uncertain, having few degrees of freedom."""
+    return 30 + 30 / jnp.maximum(freedom, 1.0)
+
+
+def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:
+    """Multiple of sigma0 below which parallaxes are explained by a rotation alone: 4, and more where sigma0 itself is
+    uncertain."""
+    return 4 + 12 / jnp.maximum(freedom, 1.0)
+
+
+def pure_rotation(pair: Pair, pose: RelativePose, noise: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether the directions p1 and R p2 agree to within the measuring error: no parallax, hence no base."""
+    rotation, base = pose.relative()
+
+    def one(point, sigma, use):
+        first, second, w2, *_ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
+        sine2 = w2 / (rot.dot(first, first) * rot.dot(second, second))
+        weight = (pair.focal_left / sigma) ** 2
+        return jnp.where(use, sine2 * weight, 0.0), jnp.where(use, weight, 0.0)
+
+    squared, weight = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
+    count = jnp.maximum(pair.count, 1.0)
+    limit = significant(pair.count - 5) * noise + 1e-9 * jnp.sqrt(weight / count)
+    return jnp.sqrt(squared / count) < limit
