@@ -6,6 +6,7 @@ which would deadlock. Pairs that do not start from the vertical are collected an
 so that they do not hold up their chunk.
 """
 
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -105,7 +106,7 @@ def _spread(pairs: Pair, run: Program, threads: int | None, chunk: int, report: 
     if shape not in run.outputs:  # one call alone compiles; the threads then find the program ready
         first = part(0)
         run.outputs[shape] = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), first)
-    out = jax.tree.map(lambda a: np.empty((total, *a.shape[1:]), a.dtype), run.outputs[shape])
+    out = jax.tree.map(lambda a: _empty((total, *a.shape[1:]), a.dtype), run.outputs[shape])
 
     def store(begin: int, result: PyTree) -> int:
         end = min(begin + size, total)
@@ -134,6 +135,18 @@ def _filled(a: np.ndarray, size: int) -> np.ndarray:
     return np.concatenate([a, np.zeros((size - a.shape[0], *a.shape[1:]), a.dtype)])
 
 
+ALIGNMENT = 64
+"""Bytes to which JAX wants memory that it takes over without a copy."""
+
+
+def _empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Memory for a result, aligned as JAX wants it."""
+    size = math.prod(shape) * dtype.itemsize
+    room = np.empty(size + ALIGNMENT, np.uint8)
+    start = -room.ctypes.data % ALIGNMENT
+    return room[start : start + size].view(dtype).reshape(shape)
+
+
 def _finish(out: PyTree) -> PyTree:
-    """NumPy leaves as JAX arrays."""
-    return jax.tree.map(jnp.asarray, out)
+    """NumPy leaves as JAX arrays in the same memory, which nobody else holds."""
+    return jax.tree.map(lambda a: jax.device_put(a, may_alias=True), out)

@@ -116,11 +116,6 @@ def inverse(n: Lower) -> tuple[Lower, Scalar]:
         scaled = dense(n) * scale[:, None] * scale[None, :]
         full = jnp.linalg.inv(scaled) * scale[:, None] * scale[None, :]
         return [[full[i, j] for j in range(i + 1)] for i in range(p)], jnp.min(jnp.linalg.eigvalsh(scaled))
-    return stage(_unrolled_inverse)(n)
-
-
-def _unrolled_inverse(n: Lower) -> tuple[Lower, Scalar]:
-    p = len(n)
     factor, pivot = cholesky(n)
     zero, one = jnp.zeros_like(n[0][0]), jnp.ones_like(n[0][0])
     solved = [substitute(factor, [one if i == k else zero for i in range(p)]) for k in range(p)]

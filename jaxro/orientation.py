@@ -16,7 +16,7 @@ from .elements import AbstractElements, DependentElements, IndependentElements, 
 from .losses import AbstractLoss
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned
-from .programs import QUICK, Program, stage, traced
+from .programs import QUICK, Program, traced
 from .reductions import counts, sums, total
 from .results import RESULTS, is_usable
 
@@ -160,13 +160,8 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     length = _length(pair, elements, base, pose)
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
-    derived = stage(
-        lambda pose, left, right: (
-            coplanarity.fundamental_matrix(pose, left, right),
-            tuple(frame[1:] for frame in coplanarity.turned(pose)),
-        )
-    )
-    f, frames = derived(pose, pair.focal_left, pair.focal_right)
+    f = coplanarity.fundamental_matrix(pose, pair.focal_left, pair.focal_right)
+    frames = tuple(frame[1:] for frame in coplanarity.turned(pose))
     each = lambda function: jax.vmap(function)(pair.coordinates, pair.mask)
     v = each(lambda point, use: coplanarity.corrections(f, point, use))
     parallax = each(

@@ -83,18 +83,17 @@ def _known(settings: tuple) -> dict[str, Any] | None:
 
 
 def stage(function: Callable) -> Callable:
-    """The function as one piece of code of its own in the compiled program, so that its results exist once.
+    """The function as a call of its own in the compiled program, so that its results exist once.
 
     XLA's CPU backend fuses a small computation into every consumer and repeats it there (an `optimization_barrier` is
-    gone before it does), and starts every small result by itself. For element-wise algebra only: library calls cannot
-    be made from such a piece. Other backends see the plain function.
+    gone before it does). Other backends see the plain function.
     """
     if jax.default_backend() != "cpu":
         return function
     compiled = jax.jit(lambda *arguments: function(*arguments))
 
     def call(*arguments):
-        with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
+        with set_xla_metadata(inlineable="false"):
             return compiled(*arguments)
 
     return call

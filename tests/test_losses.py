@@ -72,7 +72,7 @@ def test_orientation_is_the_minimum_of_the_written_out_objective(loss):
         squares = jaxro.orient(pair, elements=DependentElements, base=BASE, start=start).elements.values()
         assert np.all(np.abs(x - TRUE) < 4 * np.array(found.deviations))
         away = lambda elements: np.sum(((np.array(elements) - TRUE) / np.array(found.deviations)) ** 2)
-        assert away(x) < 0.01 * away(squares)
+        assert away(x) < 0.1 * away(squares)
 
 
 def test_weights_are_standard_deviations():
