@@ -101,7 +101,7 @@ def _spread(pairs: Pair, run: Program, threads: int | None, chunk: int, report: 
         size = chunk * min(most, -(-total // (chunk * workers)))
     begins = range(0, total, size)
     part = lambda begin: run(jax.tree.map(lambda a: _filled(a[begin : begin + size], size), pairs))
-    shape = (size, pairs.x_left.shape[1])
+    shape = (size, pairs.x_left.shape[1], pairs.x_left.dtype)
     first = None
     if shape not in run.outputs:  # one call alone compiles; the threads then find the program ready
         first = part(0)

@@ -75,9 +75,9 @@ def _worst(q: list) -> list:
 
 
 def required(freedom: Float[Array, ""]) -> Float[Array, ""]:
-    """Multiple of sigma0 below which a `margin` is not told from measuring errors: 30, and more where sigma0 itself is
-    uncertain, having few degrees of freedom."""
-    return 30 + 30 / jnp.maximum(freedom, 1.0)
+    """Multiple of sigma0 below which a `margin` is not told from measuring errors: 4, and more where sigma0 itself is
+    uncertain, having few degrees of freedom (64 with one)."""
+    return 4 + 60 / jnp.maximum(freedom, 1.0)
 
 
 def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:

@@ -32,7 +32,7 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     weakly_determined = (
         "For its errors the layout determines the elements too weakly: one of them has a standard deviation above 0.04 "
-        "rad (2°), or moving the points by some 30 sigma0 would leave one undetermined (points near a line, in one "
+        "rad (2°), or moving the points by a few sigma0 would leave one undetermined (points near a line, in one "
         "zone, or a needed zone empty). Add points far from the present ones, or look for gross errors if sigma0 is "
         "larger than you measure."
     )
