@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from . import normal_equations as normal
 from .elements import AbstractElements
 from .losses import AbstractLoss
-from .reductions import counts
+from .reductions import count
 from .results import RESULTS
 
 Parameters = Any
@@ -175,12 +175,19 @@ class Residuals(eqx.Module):
         (r, d), push = jax.linearize(lambda theta: self.groups(entries, theta), theta)
         pushed = [push(slope) for slope in slopes]
         if not d:
-            robust = None if self.loss is None else [self.loss.weight(entry**2) for entry in r]
-            return r, [column for column, _ in pushed], robust
+            return r, [column for column, _ in pushed], reweighted(self.loss, r, None)
         weight = jnp.where(self.mask, 1 / d[0], 0.0)
         half = 0.5 * r[0] * weight
-        jacobian = [[dr[0] - half * dd[0]] for dr, dd in pushed]
-        return r, jacobian, [weight if self.loss is None else weight * self.loss.weight(r[0] ** 2 * weight)]
+        return r, [[dr[0] - half * dd[0]] for dr, dd in pushed], reweighted(self.loss, r, [weight])
+
+
+def reweighted(loss: AbstractLoss | None, r: list[Array], weight: list[Array] | None) -> list[Array] | None:
+    """The weights w (None: 1) of residuals r, times rho'(w r²) of the loss."""
+    if loss is None:
+        return weight
+    if weight is None:
+        return [loss.weight(entry**2) for entry in r]
+    return [w * loss.weight(w * entry**2) for w, entry in zip(weight, r, strict=True)]
 
 
 def together(entries: list) -> Float[Array, " group"] | Float[Array, "group m"]:
@@ -218,7 +225,7 @@ def adjust(
         mask = jnp.ones(groups, bool)
     dtype = jax.tree.leaves(start)[0].dtype
     cofactor = jax.tree.map(lambda q: jnp.broadcast_to(jnp.asarray(q, dtype), (groups, *jnp.shape(q)[1:])), cofactor)
-    start = jax.lax.stop_gradient(start)
+    start = jax.lax.stop_gradient(start)  # the optimum does not depend on where it is sought
     residuals = residuals_of(condition, prepare, start, observations, cofactor, mask, loss)
     p = dimension(start)
     origin = tuple(jnp.zeros((), jax.tree.leaves(start)[0].dtype) for _ in range(p))
@@ -258,12 +265,10 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
     p = dimension(residuals.centre)
     zero = jnp.zeros((), jax.tree.leaves(residuals.centre)[0].dtype)
     r, jacobian, weight = residuals.columns((zero,) * p)
-    whitened = r
+    white = r
     if weight is not None:
-        whitened = [jnp.where(residuals.mask, entry * jnp.sqrt(w), 0.0) for entry, w in zip(r, weight, strict=True)]
-    if loss is not None:
-        robust = [loss.weight(entry * entry) for entry in whitened]
-        weight = robust if weight is None else [a * b for a, b in zip(robust, weight, strict=True)]
+        white = [jnp.where(residuals.mask, entry * jnp.sqrt(w), 0.0) for entry, w in zip(r, weight, strict=True)]
+    weight = reweighted(loss, r, weight)
     n, _, squares = normal.accumulate(r, jacobian, weight)
     q, pivot = normal.inverse(n)
     redundancy = []
@@ -271,8 +276,7 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
         column = [jacobian[k][c] for k in range(p)]
         taken = sum((1.0 if i == j else 2.0) * q[i][j] * column[i] * column[j] for i in range(p) for j in range(i + 1))
         redundancy.append(jnp.where(residuals.mask, 1 - (taken if weight is None else weight[c] * taken), 0.0))
-    (groups,) = counts(residuals.mask)
-    freedom = len(r) * groups.astype(int) - p
+    freedom = len(r) * count(residuals.mask).astype(int) - p
     checked = freedom > 0
     variance = squares / jnp.where(checked, freedom, 1).astype(r[0].dtype)
     positive = variance > 0
@@ -283,7 +287,7 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
         residuals.centre,
         normal.dense(n),
         normal.dense(q),
-        together(whitened),
+        together(white),
         together(redundancy),
         jnp.where(checked, root, jnp.nan),
         pivot,

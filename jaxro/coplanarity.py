@@ -128,7 +128,7 @@ def rays(left: Matrix | None, right: Matrix, base: Vector, point: Point, focal_l
 
 
 def intersection(
-    left: Matrix | None, right: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar
+    left: Matrix, right: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar
 ) -> tuple[Vector, Scalar, Scalar]:
     """Model point halfway between the rays at their closest, and the depth factors λ, μ.
 

@@ -1,7 +1,8 @@
 """Robust losses rho(s) of the squared whitened residual s = r², each with rho(s) = s + O(s²) at zero.
 
 A loss enters the adjustment as the transformed residual r sqrt(rho(r²)/r²), whose squares add up to the robust
-objective: optimum and implicit derivative are then both exact (design: decision 5). `scale` is in units of the whitened
+objective: optimum and implicit derivative are then both exact. The package's own solver reaches that optimum by steps
+with the weights rho'(r²) instead. `scale` is in units of the whitened
 residual, that is multiples of sigma, or mm where sigma is 1.
 """
 

@@ -17,7 +17,7 @@ from .losses import AbstractLoss
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned
 from .programs import QUICK, Program, traced
-from .reductions import counts, sums, total
+from .reductions import count, sums, total
 from .results import RESULTS, is_usable
 
 WEAK = 0.04
@@ -178,7 +178,6 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
 
     result = adjustment.result
     fair = result == RESULTS.successful
-    (behind,) = counts(pair.mask & ~in_front & ~far)
     noise = jnp.where(checked, adjustment.sigma0, 0.0)
     worst = jnp.max(jnp.diagonal(degeneracy.in_radians(solved, adjustment.cofactor)[0]))
     margin = degeneracy.margin(pair, solved, adjustment.cofactor)
@@ -186,7 +185,7 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous, RESULTS.two_solutions),
-        (behind > 0, RESULTS.points_behind_camera),
+        (count(pair.mask & ~in_front & ~far) > 0, RESULTS.points_behind_camera),
         (_undefined(elements, pose), RESULTS.elements_undefined),
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
         ((noise**2 * worst > WEAK**2) | (margin < needed * noise), RESULTS.weakly_determined),
@@ -236,8 +235,8 @@ def _length(pair: Pair, system: type[AbstractElements], base: ArrayLike | None, 
         return jnp.ones_like(pose.bx)
     if base is not None:
         return jnp.broadcast_to(jnp.asarray(base, pose.bx.dtype), pose.bx.shape)
-    count = jnp.maximum(pair.count, 1.0)
-    mean = jnp.abs(jnp.sum(jnp.where(pair.mask, pair.x_left - pair.x_right, 0.0)) / count)
+    mean = jnp.abs(total(jnp.where(pair.mask, pair.x_left - pair.x_right, 0.0)) / jnp.maximum(pair.count, 1.0))
+    # a choice of scale, not a measurement: elements have no derivative through it
     mean = lax.stop_gradient(jnp.where(mean > 1e-6 * pair.focal_left, mean, pair.focal_left))
     return jnp.where((pose.bx < 0) & (system is DependentElements), -mean, mean)
 

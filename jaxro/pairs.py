@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .reductions import counts, total
+from .reductions import count, total
 
 Coordinates = tuple[Float[Array, "*pairs point"], ...]
 """x_left, y_left, x_right, y_right"""
@@ -175,8 +175,7 @@ def cleaned(one: Pair) -> tuple[Pair, Bool[Array, "*pairs"]]:
     use = one.mask & finite
     focals = [one.focal_left, one.focal_right]
     focal_ok = [jnp.isfinite(f) & (f > 0) for f in focals]
-    (left_out,) = counts(one.mask & ~finite)
-    bad = (left_out > 0) | ~focal_ok[0] | ~focal_ok[1]
+    bad = (count(one.mask & ~finite) > 0) | ~focal_ok[0] | ~focal_ok[1]
     repaired = Pair(
         *(jnp.where(use, c, 0.0) for c in one.coordinates),
         jnp.where(use, one.sigma, 1.0),

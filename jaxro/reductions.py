@@ -36,6 +36,6 @@ def total(array: Array) -> Array:
     return sums((array,))[0]
 
 
-def counts(*flags: Array) -> tuple[Array, ...]:
-    """How many are true of each array of flags, as numbers of the default precision."""
-    return sums(tuple(flag.astype(jnp.result_type(float)) for flag in flags))
+def count(flags: Array) -> Array:
+    """How many flags are true along the last axis, as a number of the default precision."""
+    return total(flags.astype(jnp.result_type(float)))

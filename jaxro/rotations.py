@@ -48,11 +48,6 @@ def unit(a: Vector) -> Vector:
     return scaled(a, 1 / jnp.sqrt(dot(a, a)))
 
 
-def scaled_rows(m: Matrix, factor: Scalar) -> Matrix:
-    """factor * M"""
-    return (scaled(m[0], factor), scaled(m[1], factor), scaled(m[2], factor))
-
-
 def transpose(m: Matrix) -> Matrix:
     """Mᵀ"""
     return tuple(zip(*m, strict=True))  # pyright: ignore[reportReturnType]

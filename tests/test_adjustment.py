@@ -84,6 +84,18 @@ def test_line_with_errors_in_both_coordinates(solver):
     np.testing.assert_allclose(result.sigma0**2 * 8, 11.8663532, rtol=1e-8)
 
 
+def test_a_variance_may_stand_for_many_entries():
+    """A cofactor that ends above the leaves of the observation equals the one written out, for numbers and arrays."""
+    start = (jnp.asarray(5.0), jnp.asarray(-0.5))
+    x, y, variance = jnp.asarray(X), jnp.asarray(Y), jnp.asarray(1 / WX)
+    written = jaxro.adjust(line, start, (x, y), (variance, variance))
+    shared = jaxro.adjust(line, start, (x, y), variance)
+    together = jaxro.adjust(line, start, jnp.stack([x, y], axis=1), variance)
+    entries = jaxro.adjust(line, start, jnp.stack([x, y], axis=1), jnp.stack([variance, variance], axis=1))
+    for other in (shared, together, entries):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), other, written)
+
+
 def test_vector_conditions_are_whitened_together():
     """A similarity without scale between two point sets: both coordinates of both sets measured, correlated in g."""
     rng = np.random.default_rng(3)

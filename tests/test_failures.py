@@ -100,7 +100,7 @@ def rate(make):
     ids=["on a line", "two zones empty", "four points thrice", "no base, turned", "no base"],
 )
 def test_measuring_errors_do_not_hide_that_nothing_is_determined(make):
-    """Seeds that no threshold has seen; at most one in a hundred may pass."""
+    """Seeds that set no threshold; at most one in a hundred may pass."""
     assert rate(make) <= 0.01
 
 
