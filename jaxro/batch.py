@@ -30,10 +30,14 @@ SLAB_POINTS = 1 << 17
 used again for the next and that progress is seen."""
 
 
+def _everything(orientation: Orientation) -> Orientation:
+    return orientation
+
+
 def orient_batch(
     pairs: Pair,
     *,
-    select: Callable[[Orientation], PyTree] = lambda orientation: orientation,
+    select: Callable[[Orientation], PyTree] = _everything,
     progress: Callable[[int, int], None] | None = None,
     threads: int | None = None,
     chunk: int | None = None,

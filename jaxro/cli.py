@@ -115,8 +115,11 @@ def orient(
 
     Exit code 0: all usable; 1: some pair failed; 2: bad input, nothing written.
     """
+    from . import program_store
     from .io.job import Options, run
     from .io.tables import TableError
+
+    program_store.use(program_store.default_folder())
 
     options = Options(
         file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force

@@ -10,9 +10,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import numpy as np
 from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import PyTree
+
+from . import program_store
 
 FAST = {
     "xla_cpu_enable_fast_math": True,
@@ -53,22 +56,39 @@ class Program:
         self._function = function
 
     def __call__(self, data: PyTree) -> PyTree:
-        return _compiled(self._function, self._static, self._settings)(data, self._arrays)
+        key = self._function, self._static, self._settings
+        arguments = data, self._arrays
+        if program_store.active():
+            shapes = tuple((np.shape(a), str(a.dtype)) for a in jax.tree.leaves(arguments))
+            stored = _beside(*key).setdefault("stored", {})
+            if shapes not in stored:
+                function, settings = _flat(self._function, self._static), _settings(self._settings)
+                stored[shapes] = program_store.compiled(function, settings, arguments, key)
+            return stored[shapes](arguments)
+        return _compiled(*key)(*arguments)
 
     @property
     def outputs(self) -> dict[Any, PyTree]:
         """Room for a caller to keep the shapes of its results, as long as the compiled program lives."""
-        return _outputs(self._function, self._static, self._settings)
+        return _beside(self._function, self._static, self._settings).setdefault("outputs", {})
+
+
+def _flat(function: Callable, static: _Key) -> Callable:
+    return lambda data, arrays: function(data, **eqx.combine(arrays, static.tree))
+
+
+def _settings(settings: tuple) -> dict[str, Any] | None:
+    return _known(settings) if jax.default_backend() == "cpu" else None
 
 
 @lru_cache(maxsize=64)
 def _compiled(function: Callable, static: _Key, settings: tuple) -> Callable:
-    known = _known(settings) if jax.default_backend() == "cpu" else None
-    return jax.jit(lambda data, arrays: function(data, **eqx.combine(arrays, static.tree)), compiler_options=known)
+    return jax.jit(_flat(function, static), compiler_options=_settings(settings))
 
 
 @lru_cache(maxsize=64)
-def _outputs(function: Callable, static: _Key, settings: tuple) -> dict[Any, PyTree]:
+def _beside(function: Callable, static: _Key, settings: tuple) -> dict[str, dict]:
+    """What is remembered of a program."""
     return {}
 
 

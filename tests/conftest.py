@@ -10,6 +10,8 @@ from jaxtyping import install_import_hook
 # has to come before the first import of the package, in this process and for its submodules
 install_import_hook("jaxro", "beartype.beartype")
 
+os.environ["JAXRO_CACHE"] = ""  # no test finds what another one left
+
 import jax  # noqa: E402
 
 import jaxro  # noqa: E402, F401  (64 bit)

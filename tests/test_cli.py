@@ -3,6 +3,9 @@
 import csv
 import json
 import math
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -184,3 +187,20 @@ def test_nothing_is_left_of_a_result_that_could_not_be_written(tmp_path, monkeyp
     monkeypatch.setattr("jaxro.io.files.os.replace", full)
     result = run("--out", tmp_path / "out")
     assert result.exit_code == 2 and "No space left" in result.stderr and not list(tmp_path.iterdir())
+
+
+def test_kept_programs_change_nothing_but_the_time(tmp_path, sample):
+    def call(*arguments) -> str:
+        command = [sys.executable, "-W", "error", "-m", "jaxro", "orient", *map(str, arguments)]
+        environment = os.environ | {"JAXRO_CACHE": str(tmp_path / "kept")}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+        assert not done.stderr
+        return done.stdout
+
+    first = call()
+    (program,) = (tmp_path / "kept").iterdir()
+    content = program.read_bytes()
+    assert call() == first and program.read_bytes() == content
+    program.write_bytes(content[:1000])  # cut short: compiled and written again
+    assert call() == first and len(program.read_bytes()) > 1000
+    assert call(sample, *FOCAL) != first and len(list((tmp_path / "kept").iterdir())) == 2

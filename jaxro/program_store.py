@@ -1,0 +1,119 @@
+"""Compiled programs on disk, so that the next process compiles nothing.
+
+Off unless a caller names a folder (`use`): the command line does, a library call writes nothing. A program is found
+again by everything it depends on: the source of this package, the versions of JAX, the processor, the compiler
+settings, the static options and the shapes. The files are pickles, in a folder that only its owner may write to.
+"""
+
+import hashlib
+import os
+import pickle
+import platform
+import tempfile
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jaxlib
+from jaxtyping import PyTree
+
+MOST = 40
+"""Programs kept, of about 1 MB each; the oldest go."""
+
+_folder: Path | None = None
+
+
+def use(folder: Path | None) -> None:
+    """Keep compiled programs in this folder from now on (None: nowhere)."""
+    global _folder
+    _folder = folder
+
+
+def default_folder() -> Path | None:
+    """The user's cache folder for this program; none where the environment variable JAXRO_CACHE is empty."""
+    if "JAXRO_CACHE" in os.environ:
+        return Path(os.environ["JAXRO_CACHE"]) if os.environ["JAXRO_CACHE"] else None
+    root = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
+    return Path(root) / "jaxro"
+
+
+def active() -> bool:
+    """Whether programs are kept."""
+    return _folder is not None
+
+
+def compiled(function: Callable, settings: dict[str, Any] | None, data: PyTree, key: PyTree) -> Callable:
+    """jit(function) for data of these shapes, from the folder if it is there, else compiled and stored.
+
+    `key`: what else `function` depends on, of values that can be pickled.
+    """
+    leaves, structure = jax.tree.flatten(data)
+    shapes = [(a.shape, str(a.dtype)) for a in map(jax.typeof, leaves)]
+    content = pickle.dumps((_surroundings(), settings, shapes, str(structure), key))
+    path = (_folder or Path()) / f"{hashlib.sha256(content).hexdigest()}.program"
+    stored = _read(path)
+    if stored is None:
+        shape = None
+
+        def flat(*leaves):
+            nonlocal shape
+            out, shape = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
+            return out
+
+        from jax.experimental import serialize_executable
+
+        program = jax.jit(flat, compiler_options=settings).lower(*leaves).compile()
+        # the structure itself cannot be pickled, but an object of that structure can
+        like = jax.tree.unflatten(shape, [0] * shape.num_leaves)
+        _write(path, pickle.dumps((*serialize_executable.serialize(program), like)))
+    else:
+        program, like = stored
+    out_structure = jax.tree.structure(like)
+    return lambda data: jax.tree.unflatten(out_structure, program(*jax.tree.leaves(data)))
+
+
+def _read(path: Path) -> tuple[Callable, PyTree] | None:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    try:
+        *executable, like = pickle.loads(content)
+        from jax.experimental import serialize_executable
+
+        return serialize_executable.deserialize_and_load(*executable), like
+    except Exception:  # whatever is wrong with the file: compiling again writes a good one
+        return None
+
+
+def _write(path: Path, content: bytes) -> None:
+    """The whole file or none; a folder that cannot be written to costs only time."""
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.replace(temporary, path)
+        newest_first = sorted(path.parent.glob("*.program"), key=lambda file: file.stat().st_mtime, reverse=True)
+        for old in newest_first[MOST:]:
+            old.unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+@lru_cache
+def _surroundings() -> tuple:
+    """What every program depends on."""
+    source = hashlib.sha256()
+    for file in sorted(Path(__file__).parent.rglob("*.py")):
+        source.update(file.read_bytes())
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        processor = next(line for line in lines if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        processor = platform.processor()
+    versions = (jax.__version__, jaxlib.__version__, platform.python_version())
+    flags = (os.environ.get("XLA_FLAGS"), jax.config.jax_enable_x64, os.cpu_count())
+    return source.hexdigest(), platform.machine(), processor, versions, flags
