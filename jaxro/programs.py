@@ -26,6 +26,8 @@ FAST = {
 }
 """Sums may be reordered, without which the CPU cannot vectorise them; NaN, infinity and division stay exact."""
 
+WIDE = {"xla_cpu_prefer_vector_width": 512}
+"""Vectors of eight numbers where the processor has them."""
 
 QUICK = {**FAST, "xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 """For single pairs: the older code generator at a lower level compiles in half the time, and runs no slower there."""

@@ -5,6 +5,7 @@
 | `Vertical` | 5 | parallel axes, base along x: zero elements, the normal case of aerial photography |
 | `General` | 5 | any position: five-point and eight-point solutions, chosen by cheirality and residual |
 | `Auto` | 5 | `Vertical` where two steps from it fit, `General` for the rest |
+| `SixPoints` | 6 | first-order closed form of near-vertical photos from their six standard zones (1971) |
 
 Known elements are a start, too: pass them instead.
 """
@@ -12,4 +13,5 @@ Known elements are a start, too: pass them instead.
 from .auto import Auto as Auto
 from .base import AbstractStart as AbstractStart, Begin as Begin
 from .general import General as General
+from .six_points import SixPoints as SixPoints
 from .vertical import Vertical as Vertical

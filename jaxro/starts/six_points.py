@@ -13,7 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..elements import IndependentElements
+from ..elements import IndependentElements, to_pose
+from ..pairs import Pair
+from ..reductions import total
+from .base import AbstractStart, Begin
 
 Scalar = Float[Array, ""] | float
 
@@ -40,6 +43,28 @@ def six_points(q: Float[Array, "6"], y: Scalar, base: Scalar, focal: Scalar) -> 
         phi2=tilt * (q5 - q3),
         kappa2=(focal * omega2 - q1) / base,
     )
+
+
+class SixPoints(AbstractStart):
+    """The closed form on the points nearest to the six zones, for near-vertical photos with points in all of them.
+
+    Error: second order in the angles, and first order in the distances of the points from their zones.
+    """
+
+    def __call__(self, pair: Pair) -> Begin:
+        focal = pair.focal_left
+        parallax = pair.y_left - pair.y_right * (focal / pair.focal_right)
+        base = total(jnp.where(pair.mask, pair.x_left - pair.x_right, 0.0)) / jnp.maximum(pair.count, 1.0)
+        reach = jnp.max(jnp.where(pair.mask, jnp.abs(pair.y_left), 0.0))
+        zones = [(right * base, side * reach) for side in (0, 1, -1) for right in (0, 1)]
+        nearest = []
+        for x, y in zones:
+            distance = (pair.x_left - x) ** 2 + (pair.y_left - y) ** 2
+            nearest.append(jnp.argmin(jnp.where(pair.mask, distance, jnp.inf)))
+        y = sum(jnp.abs(pair.y_left[i]) for i in nearest[2:]) / 4
+        elements = six_points(jnp.stack([parallax[i] for i in nearest]), y, base, focal)
+        no = jnp.zeros_like(focal, bool)
+        return Begin(to_pose(elements), no, no)
 
 
 def first_order_design(
