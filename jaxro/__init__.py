@@ -10,9 +10,17 @@ import jax as _jax
 if "JAX_ENABLE_X64" not in _os.environ:
     _jax.config.update("jax_enable_x64", True)
 
-from . import coplanarity as coplanarity, losses as losses, rotations as rotations, starts as starts
+from . import (
+    coplanarity as coplanarity,
+    critical_values as critical_values,
+    losses as losses,
+    rejection as rejection,
+    rotations as rotations,
+    simulation as simulation,
+    starts as starts,
+)
 from .adjustment import Adjustment as Adjustment, adjust as adjust
-from .batch import orient_batch as orient_batch
+from .batch import clean_batch as clean_batch, orient_batch as orient_batch
 from .elements import (
     AbstractElements as AbstractElements,
     DependentElements as DependentElements,

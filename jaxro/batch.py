@@ -20,6 +20,7 @@ from jaxtyping import Array, PyTree
 from .orientation import Orientation, orient, orient_near
 from .pairs import Pair
 from .programs import FAST, WIDE, Program
+from .rejection import AbstractProcedure, Rejection
 from .starts import AbstractStart, Auto
 
 CHUNK_POINTS = 16384
@@ -33,8 +34,8 @@ SLAB_POINTS = 1 << 17
 used again for the next and that progress is seen."""
 
 
-def _everything(orientation: Orientation) -> Orientation:
-    return orientation
+def _everything(result: Any) -> Any:
+    return result
 
 
 def orient_batch(
@@ -53,15 +54,11 @@ def orient_batch(
     `progress(done, total)` is called from the calling thread. Other keywords are those of `orient`. The results are
     those of `orient` one by one, to rounding.
     """
-    if pairs.x_left.ndim != 2:
-        raise ValueError(f"orient_batch takes a batch of pairs (pair, point), got coordinates of {pairs.x_left.shape}")
-    points = pairs.x_left.shape[1]
-    if chunk is None:
-        chunk = min(128, max(4, 1 << (CHUNK_POINTS // max(points, 1)).bit_length() - 1))
+    chunk = _chunk(pairs, chunk)
     if options.get("base") is not None:
         options["base"] = jnp.asarray(options["base"], pairs.x_left.dtype)  # an argument: no program for each value
     options = options | {"select": select, "chunk": chunk}
-    settings = FAST if points > FEW else FAST | WIDE
+    settings = _settings(pairs)
     host = jax.tree.map(np.asarray, pairs)
     report = progress or (lambda done, total: None)
     if not isinstance(start, Auto):
@@ -75,6 +72,38 @@ def orient_batch(
         for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(again), strict=True):
             target[rest] = source
     return _finish(out)
+
+
+def clean_batch(
+    pairs: Pair,
+    procedure: AbstractProcedure,
+    *,
+    select: Callable[[Rejection], PyTree] = _everything,
+    progress: Callable[[int, int], None] | None = None,
+    threads: int | None = None,
+    chunk: int | None = None,
+) -> PyTree:
+    """`procedure` of every pair of a batch (pairs on the leading axis), on all cores; keywords as of `orient_batch`.
+
+    `select=lambda r: r.mask` computes no log and no statistics that the decision does not need.
+    """
+    chunk = _chunk(pairs, chunk)
+    program = Program(_slab_cleaned, {"procedure": procedure, "select": select, "chunk": chunk}, _settings(pairs))
+    report = progress or (lambda done, total: None)
+    return _finish(_spread(jax.tree.map(np.asarray, pairs), program, threads, chunk, report))
+
+
+def _chunk(pairs: Pair, chunk: int | None) -> int:
+    """Pairs per chunk, as given or by the number of points."""
+    if pairs.x_left.ndim != 2:
+        raise ValueError(f"a batch of pairs (pair, point) is wanted, got coordinates of shape {pairs.x_left.shape}")
+    if chunk is not None:
+        return chunk
+    return min(128, max(4, 1 << (CHUNK_POINTS // max(pairs.x_left.shape[1], 1)).bit_length() - 1))
+
+
+def _settings(pairs: Pair) -> dict[str, Any]:
+    return FAST if pairs.x_left.shape[1] > FEW else FAST | WIDE
 
 
 def _chunked(one: Callable, pairs: Pair, chunk: int) -> PyTree:
@@ -96,6 +125,10 @@ def _slab_near(pairs: Pair, *, select: Callable, chunk: int, start: Auto, **opti
         return select(orientation), fits
 
     return _chunked(one, pairs, chunk)
+
+
+def _slab_cleaned(pairs: Pair, *, procedure: AbstractProcedure, select: Callable, chunk: int) -> PyTree:
+    return _chunked(lambda pair: select(procedure(pair)), pairs, chunk)
 
 
 def _spread(pairs: Pair, run: Program, threads: int | None, chunk: int, report: Callable) -> PyTree:

@@ -11,6 +11,9 @@ from jaxtyping import install_import_hook
 install_import_hook("jaxro", "beartype.beartype")
 
 os.environ["JAXRO_CACHE"] = ""  # no test finds what another one left
+# most of the time goes into compiling programs that run once
+cheap = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {cheap}".strip()
 
 import jax  # noqa: E402
 

@@ -1,0 +1,64 @@
+"""Critical values of the tests on residuals, by formula; all work under jit.
+
+`level` is the probability that a test without any error rejects: of one point, or of a whole pair where the docstring
+says so.
+"""
+
+import jax.numpy as jnp
+from jax.scipy.special import betainc, gammaincc, ndtri
+from jaxtyping import Array, ArrayLike, Float
+
+Scalar = Float[Array, "..."]
+
+BISECTIONS = 60
+"""Halvings of an interval: to the last bit of a double."""
+
+
+def normal(level: ArrayLike) -> Scalar:
+    """Two-sided: |w| exceeds it with probability `level` (Baarda's w)."""
+    return -ndtri(jnp.asarray(level, float) / 2)
+
+
+def student(level: ArrayLike, freedom: ArrayLike) -> Scalar:
+    """One-sided: t with `freedom` degrees of freedom exceeds it with probability `level`, at most one half."""
+    level, freedom = jnp.asarray(level, float), jnp.asarray(freedom, float)
+    # P(T > t) = I_x(f/2, 1/2) / 2 at x = f / (f + t²): found by bisection, since the inverse has no closed form
+    low, high = jnp.zeros_like(level * freedom), jnp.ones_like(level * freedom)
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        above = betainc(freedom / 2, 0.5, middle) / 2 > level
+        low, high = jnp.where(above, low, middle), jnp.where(above, middle, high)
+    x = (low + high) / 2
+    return jnp.sqrt(freedom * (1 - x) / x)
+
+
+def tau(level: ArrayLike, freedom: ArrayLike) -> Scalar:
+    """Two-sided, of a residual over its estimated standard deviation (Pope 1976): sqrt(f) t / sqrt(f - 1 + t²), with t
+    of f - 1 degrees of freedom. With one degree of freedom every residual has tau = 1, and nothing can be rejected."""
+    freedom = jnp.asarray(freedom, float)
+    t = student(jnp.asarray(level, float) / 2, jnp.maximum(freedom - 1, 1.0))
+    value = jnp.sqrt(freedom) * t / jnp.sqrt(freedom - 1 + t * t)
+    return jnp.where(freedom > 1, value, jnp.inf)
+
+
+def chi_squared(level: ArrayLike, freedom: ArrayLike) -> Scalar:
+    """A sum of `freedom` squared normal numbers exceeds it with probability `level`."""
+    level, freedom = jnp.asarray(level, float), jnp.asarray(freedom, float)
+    low = jnp.zeros_like(level * freedom)
+    high = low + freedom + 20 * jnp.sqrt(freedom) + 60
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        above = gammaincc(freedom / 2, middle / 2) > level
+        low, high = jnp.where(above, middle, low), jnp.where(above, high, middle)
+    return (low + high) / 2
+
+
+def grubbs(level: ArrayLike, count: ArrayLike) -> Scalar:
+    """One-sided, of (mean - smallest) / S of a normal sample, S over n as in eq. (9) of 1989:
+
+    v = G sqrt(n/(n-1)),    G = (n-1)/sqrt(n) sqrt(t²/(n-2+t²)),    t of level/n with n - 2 degrees of freedom.
+    """
+    n = jnp.asarray(count, float)
+    t = student(jnp.asarray(level, float) / n, jnp.maximum(n - 2, 1.0))
+    g = (n - 1) / jnp.sqrt(n) * jnp.sqrt(t**2 / (n - 2 + t**2))
+    return jnp.where(n > 2, g * jnp.sqrt(n / (n - 1)), jnp.inf)
