@@ -4,7 +4,11 @@
 says so.
 """
 
+from collections.abc import Callable
+
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.scipy.special import betainc, gammaincc, ndtri
 from jaxtyping import Array, ArrayLike, Float
 
@@ -23,12 +27,7 @@ def student(level: ArrayLike, freedom: ArrayLike) -> Scalar:
     """One-sided: t with `freedom` degrees of freedom exceeds it with probability `level`, at most one half."""
     level, freedom = jnp.asarray(level, float), jnp.asarray(freedom, float)
     # P(T > t) = I_x(f/2, 1/2) / 2 at x = f / (f + t²): found by bisection, since the inverse has no closed form
-    low, high = jnp.zeros_like(level * freedom), jnp.ones_like(level * freedom)
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        above = betainc(freedom / 2, 0.5, middle) / 2 > level
-        low, high = jnp.where(above, low, middle), jnp.where(above, middle, high)
-    x = (low + high) / 2
+    x = _where(lambda x: betainc(freedom / 2, 0.5, x) / 2 > level, jnp.ones_like(level * freedom), increasing=True)
     return jnp.sqrt(freedom * (1 - x) / x)
 
 
@@ -44,13 +43,8 @@ def tau(level: ArrayLike, freedom: ArrayLike) -> Scalar:
 def chi_squared(level: ArrayLike, freedom: ArrayLike) -> Scalar:
     """A sum of `freedom` squared normal numbers exceeds it with probability `level`."""
     level, freedom = jnp.asarray(level, float), jnp.asarray(freedom, float)
-    low = jnp.zeros_like(level * freedom)
-    high = low + freedom + 20 * jnp.sqrt(freedom) + 60
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        above = gammaincc(freedom / 2, middle / 2) > level
-        low, high = jnp.where(above, middle, low), jnp.where(above, high, middle)
-    return (low + high) / 2
+    most = jnp.zeros_like(level) + freedom + 20 * jnp.sqrt(freedom) + 60
+    return _where(lambda x: gammaincc(freedom / 2, x / 2) > level, most, increasing=False)
 
 
 def grubbs(level: ArrayLike, count: ArrayLike) -> Scalar:
@@ -62,3 +56,24 @@ def grubbs(level: ArrayLike, count: ArrayLike) -> Scalar:
     t = student(jnp.asarray(level, float) / n, jnp.maximum(n - 2, 1.0))
     g = (n - 1) / jnp.sqrt(n) * jnp.sqrt(t**2 / (n - 2 + t**2))
     return jnp.where(n > 2, g * jnp.sqrt(n / (n - 1)), jnp.inf)
+
+
+def by_count(value: Callable[[Array], Scalar], most: int, count: Float[Array, "..."]) -> Scalar:
+    """value(count) for a count of 0 to `most` that is known only at run time: looked up, not calculated again."""
+    with jax.ensure_compile_time_eval():
+        table = value(jnp.arange(most + 1.0))
+    here = jnp.arange(most + 1) == count.astype(int)[..., None]
+    return jnp.sum(jnp.where(here, table, 0.0), axis=-1)
+
+
+def _where(above: Callable[[Array], Array], most: Array, increasing: bool) -> Scalar:
+    """The x in (0, most) at which `above` changes, by bisection."""
+
+    def halved(_, interval):
+        low, high = interval
+        middle = (low + high) / 2
+        down = above(middle) == increasing
+        return jnp.where(down, low, middle), jnp.where(down, middle, high)
+
+    low, high = lax.fori_loop(0, BISECTIONS, halved, (jnp.zeros_like(most), most))
+    return (low + high) / 2

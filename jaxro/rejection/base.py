@@ -35,8 +35,9 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
 
 class Log(eqx.Module):
-    """The decisions by round, (round, ...) each; rounds that did not take place are zero. A round with an infinite limit
-    is an iteration and no decision.
+    """The decisions by round, (round, ...) each; rounds that did not take place are zero.
+
+    A round with an infinite limit is an iteration and no decision.
 
     `statistic` of every point (inf: wrong by any measure), the `limit` it was held against, the points `rejected`, the
     residual `parallax` (of points in use) and the `elements` (phi1, kappa1, omega2, phi2, kappa2) it was judged by.

@@ -60,7 +60,7 @@ class Dorozhinsky(AbstractProcedure):
         history = recorded(history, Round(first, jnp.asarray(self.eps1), gross, first, values(zero)))
 
         def cycle(state):
-            history, _, _, done = state
+            history, *_ = state
             elements = zero
             for _ in range(self.iterations):
                 history, elements = self._iteration(pair, history, elements)

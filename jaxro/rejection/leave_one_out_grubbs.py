@@ -111,7 +111,7 @@ class LeaveOneOutGrubbs(AbstractProcedure):
         def judge(mask, history):
             solved = by_parallax(pair, mask)
             v, testable = self.statistic(pair, mask, solved.pose)
-            limit = self.limit(count(testable), count(mask))
+            limit = self.limit(pair, mask, testable)
             out = largest(v, testable) & (v > limit) & (count(mask) > self.least)
             return Round(v, limit, out, solved.parallax, values(solved.elements))
 
@@ -123,13 +123,16 @@ class LeaveOneOutGrubbs(AbstractProcedure):
         means, testable = (refitted if self.exact else closed_form)(pair, mask, elements)
         return grubbs_statistic(means, testable), testable
 
-    def limit(self, testable: Float[Array, ""], used: Float[Array, ""]) -> Float[Array, ""]:
-        """The critical value for so many testable points of so many used."""
+    def limit(self, pair: Pair, mask: Bool[Array, "point"], testable: Bool[Array, "point"]) -> Float[Array, ""]:
+        """The critical value for so many points in use, of which so many can be tested."""
+        formula = critical_values.by_count(
+            lambda n: critical_values.grubbs(self.level, n), pair.x_left.shape[0], count(testable)
+        )
         if self.critical is None:
-            return critical_values.grubbs(self.level, testable)
-        known = jnp.arange(self.critical.shape[0]) == used.astype(int)
-        value = total(jnp.where(known, self.critical, 0.0))
-        return jnp.where(value > 0, value, critical_values.grubbs(self.level, testable))
+            return formula
+        here = jnp.arange(self.critical.shape[0]) == count(mask).astype(int)
+        known = total(jnp.where(here, self.critical, 0.0))
+        return jnp.where(known > 0, known, formula)
 
 
 def calibrated(
