@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import coplanarity
 from ..adjustment import Residuals
-from ..elements import AbstractElements, IndependentElements
+from ..elements import AbstractElements, IndependentElements, RelativePose, convert
 from ..normal_equations import steps
 from ..orientation import Orientation, orient
 from ..pairs import Pair
@@ -214,6 +214,11 @@ def residuals_at(pair: Pair, mask: Bool[Array, "point"], elements: AbstractEleme
 def values(elements: AbstractElements) -> Float[Array, "*pairs 5"]:
     """The five elements as an array, for the log."""
     return jnp.stack(elements.values(), axis=-1)
+
+
+def independent(pose: RelativePose) -> Float[Array, "*pairs 5"]:
+    """The independent elements of a pose, for the log."""
+    return values(convert(pose, IndependentElements, jnp.ones_like(pose.bx)))
 
 
 def ended(history: History, orientation: Orientation, outcome: OUTCOMES) -> Rejection:

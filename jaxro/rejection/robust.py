@@ -1,0 +1,91 @@
+"""Steps of reweighted Gauss-Newton on the distances of the points, and the set of points that agree with a pose."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .. import coplanarity
+from ..adjustment import Residuals
+from ..elements import RelativePose
+from ..normal_equations import accumulate, cholesky, solve, substitute
+from ..pairs import Pair
+
+Values = Float[Array, "point"]
+Use = Bool[Array, "point"]
+
+
+class Linear(NamedTuple):
+    """The conditions of the points at a pose: g, the columns of dg/dx, weights 1/d (zero where masked)."""
+
+    g: Values
+    columns: list[Values]
+    weight: Values
+
+    @property
+    def squares(self) -> Values:
+        """(r / sigma)² of the points."""
+        return self.weight * self.g * self.g
+
+
+def scaled(pair: Pair, sigma: float | None) -> Pair:
+    """The pair with the given standard deviation of its coordinates, or its own."""
+    if sigma is None:
+        return pair
+    known = jnp.full_like(pair.sigma, sigma)
+    return Pair(*pair.coordinates, known, pair.mask, pair.focal_left, pair.focal_right)
+
+
+def at(pair: Pair, pose: RelativePose) -> Linear:
+    """The conditions of a pair linearised at a pose, whitened with its sigma."""
+    prepare, condition, observations, cofactor = coplanarity.rigorous(pair)
+    residuals = Residuals(prepare, condition, pose, observations, cofactor, pair.mask)
+    (g,), jacobian, weight = residuals.columns((jnp.zeros_like(pair.focal_left),) * 5)
+    return Linear(g, [column for (column,) in jacobian], weight[0])  # pyright: ignore[reportOptionalSubscript]
+
+
+def stepped(pose: RelativePose, linear: Linear, weight: Values, most: float = 0.3) -> RelativePose:
+    """The pose after one Gauss-Newton step with these weights in place of those of `linear`, no component longer than
+    `most` (rad)."""
+    n, h, _ = accumulate([linear.g], [[c] for c in linear.columns], [weight])
+    delta = solve(n, h)
+    longest = delta[0] * 0
+    for d in delta:
+        longest = jnp.maximum(longest, jnp.abs(d))
+    shrink = jnp.minimum(1.0, most / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny))
+    shrink = jnp.where(jnp.isfinite(longest), shrink, 0.0)
+    moved = pose.moved(tuple(jnp.where(jnp.isfinite(d), -shrink * d, 0.0) for d in delta))
+    return moved.normalised()
+
+
+def reweighted(pair: Pair, pose: RelativePose, weight: Callable[[Values], Values]) -> RelativePose:
+    """One step with the weights `weight`((r / sigma)²)."""
+    linear = at(pair, pose)
+    return stepped(pose, linear, linear.weight * weight(linear.squares))
+
+
+def normalised(linear: Linear, use: Use) -> Values:
+    """|w| of all points against the solution of those in use.
+
+    A point in use has the variance 1 - h, h = a N⁻¹ aᵀ its leverage; one not in use has 1 + h.
+    """
+    weight = jnp.where(use, linear.weight, 0.0)
+    n, _, _ = accumulate([linear.g], [[c] for c in linear.columns], [weight])
+    z = substitute(cholesky(n)[0], linear.columns)
+    h = linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True))
+    variance = jnp.where(use, jnp.maximum(1 - h, 1e-6), 1 + h)
+    return jnp.sqrt(linear.squares / variance)
+
+
+def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: float, rounds: int) -> tuple[RelativePose, Use]:
+    """The pose of the points with |w| <= limit, found in turns: solve, judge every point anew."""
+
+    def turn(_, state):
+        pose, use = state
+        linear = at(pair, pose)
+        pose = stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
+        return pose, pair.mask & (normalised(at(pair, pose), use) <= limit)
+
+    return jax.lax.fori_loop(0, rounds, turn, (pose, use))
