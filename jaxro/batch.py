@@ -20,7 +20,7 @@ from jaxtyping import Array, PyTree
 from .orientation import Orientation, orient, orient_near
 from .pairs import Pair
 from .programs import FAST, WIDE, Program
-from .rejection import AbstractProcedure, Rejection
+from .rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
 from .starts import AbstractStart, Auto
 
 CHUNK_POINTS = 16384
@@ -69,9 +69,13 @@ def orient_batch(
         left_over = jax.tree.map(lambda a: a[rest], host)
         general = Program(_slab, options | {"start": start.general})
         again = _spread(left_over, general, threads, chunk, lambda done, total: None)
-        for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(again), strict=True):
-            target[rest] = source
+        _replace(out, rest, again)
     return _finish(out)
+
+
+def _replace(out: PyTree, rows: np.ndarray, new: PyTree) -> None:
+    for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(new), strict=True):
+        target[rows] = source
 
 
 def clean_batch(
@@ -88,9 +92,24 @@ def clean_batch(
     `select=lambda r: r.mask` computes no log and no statistics that the decision does not need.
     """
     chunk = _chunk(pairs, chunk)
-    program = Program(_slab_cleaned, {"procedure": procedure, "select": select, "chunk": chunk}, _settings(pairs))
+    host = jax.tree.map(np.asarray, pairs)
     report = progress or (lambda done, total: None)
-    return _finish(_spread(jax.tree.map(np.asarray, pairs), program, threads, chunk, report))
+
+    def run(pairs: Pair, procedure: AbstractProcedure, report: Callable) -> tuple[PyTree, np.ndarray]:
+        program = Program(_slab_cleaned, {"procedure": procedure, "select": select, "chunk": chunk}, _settings(pairs))
+        return _spread(pairs, program, threads, chunk, report)
+
+    if not isinstance(procedure, Recommended):
+        return _finish(run(host, procedure, report)[0])
+    first, *others = procedure.stages()
+    out, again = run(host, first, report)
+    for stage in others:
+        rest = np.flatnonzero(again)
+        if rest.size:
+            new, doubtful = run(jax.tree.map(lambda a, rest=rest: a[rest], host), stage, lambda done, total: None)
+            _replace(out, rest, new)
+            again[rest] = doubtful
+    return _finish(out)
 
 
 def _chunk(pairs: Pair, chunk: int | None) -> int:
@@ -127,8 +146,14 @@ def _slab_near(pairs: Pair, *, select: Callable, chunk: int, start: Auto, **opti
     return _chunked(one, pairs, chunk)
 
 
-def _slab_cleaned(pairs: Pair, *, procedure: AbstractProcedure, select: Callable, chunk: int) -> PyTree:
-    return _chunked(lambda pair: select(procedure(pair)), pairs, chunk)
+def _slab_cleaned(pairs: Pair, *, procedure: AbstractProcedure, select: Callable, chunk: int) -> tuple[PyTree, Array]:
+    """What is selected, and whether the procedure was not convinced."""
+
+    def one(pair: Pair):
+        rejection = procedure(pair)
+        return select(rejection), rejection.outcome == OUTCOMES.no_consensus
+
+    return _chunked(one, pairs, chunk)
 
 
 def _spread(pairs: Pair, run: Program, threads: int | None, chunk: int, report: Callable) -> PyTree:

@@ -1,9 +1,9 @@
-"""The command line: `jaxro orient [FILE.csv]`.
+"""The command line: `jaxro orient`, `clean`, `compare`, `reproduce`.
 
 Exit code 0: every pair has usable elements; 1: at least one has not; 2: the input could not be used.
 """
 
-import enum
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -12,22 +12,13 @@ try:
 except ModuleNotFoundError:
     raise SystemExit("The command line needs typer and rich: pip install 'jaxro[cli]'") from None
 
+from .experiments import REPRODUCTIONS
+from .io import arguments as given
+from .io.arguments import Residual
+from .io.tables import TableError
+from .rejection import PROCEDURES
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, rich_markup_mode=None)
-
-
-class System(enum.StrEnum):
-    """Elements by the names of the command line."""
-
-    relative = "relative"
-    dependent = "dependent"
-    independent = "independent"
-
-
-class Residual(enum.StrEnum):
-    """Residuals by the names of the command line."""
-
-    rigorous = "rigorous"
-    parallax = "parallax"
 
 
 @app.callback()
@@ -37,96 +28,165 @@ def main() -> None:
 
 @app.command()
 def orient(
-    file: Annotated[
-        Path | None,
-        typer.Argument(
-            help="CSV table with the columns point,x_left,y_left,x_right,y_right (or id,xl,yl,xr,yr) and optionally "
-            "pair, sigma. Without it the embedded example is oriented.",
-            metavar="FILE.csv",
-            show_default=False,
-        ),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            help="[camera], or [left] and [right], or [photo.NAME] for pairs named LEFT-RIGHT or LEFT_RIGHT; "
-            "keys focal, principal_point, pixel_size, y_down.",
-            metavar="FILE.toml",
-            show_default=False,
-        ),
-    ] = None,
-    focal: Annotated[
-        float | None, typer.Option(help="Focal length in photo units, of both photos.", metavar="F", show_default=False)
-    ] = None,
-    principal_point: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            help="Principal point x y, in the units of the table.  [default: 0 0]", metavar="X Y", show_default=False
-        ),
-    ] = None,
-    pixel_size: Annotated[
-        float | None,
-        typer.Option(
-            help="Photo units per unit of the table, e.g. mm per pixel.  [default: 1]",
-            metavar="SIZE",
-            show_default=False,
-        ),
-    ] = None,
-    y_down: Annotated[bool, typer.Option("--y-down", help="y of the table counts downwards.")] = False,
-    sigma: Annotated[
-        float | None,
-        typer.Option(
-            help="Standard deviation of every coordinate before the adjustment, in the units of the table; "
-            "sigma0 is then a ratio to it.",
-            metavar="SD",
-            show_default=False,
-        ),
-    ] = None,
-    elements: Annotated[
-        System | None,
-        typer.Option(
-            help="System of elements.  [default: relative, which exists for photos in any position; "
-            "dependent for the example]",
-            show_default=False,
-        ),
-    ] = None,
-    base: Annotated[
-        float | None,
-        typer.Option(
-            help="bx of the dependent, b of the independent system: the scale of the model.  "
-            "[default: mean x-parallax]",
-            metavar="B",
-            show_default=False,
-        ),
-    ] = None,
-    residual: Annotated[
-        Residual, typer.Option(help="What is minimised: whitened conditions, or strict y-parallaxes.")
-    ] = Residual.rigorous,
-    unit: Annotated[str, typer.Option(help="Name of the photo unit in reports: mm, px.", metavar="NAME")] = "mm",
+    file: Annotated[Path | None, given.file("Without it the embedded example is oriented.")] = None,
+    camera: given.Camera = None,
+    focal: given.Focal = None,
+    principal_point: given.PrincipalPoint = None,
+    pixel_size: given.PixelSize = None,
+    y_down: given.YDown = False,
+    sigma: given.Sigma = None,
+    elements: given.Elements = None,
+    base: given.Base = None,
+    residual: given.Minimised = Residual.rigorous,
+    unit: given.Unit = "mm",
     out: Annotated[
         Path | None,
         typer.Option(
             help="Folder for elements.csv, residuals.csv, points.csv, summary.json.", metavar="DIR", show_default=False
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite the files in a folder that is not empty.")] = False,
+    force: given.Force = False,
 ) -> None:
     """Orient every pair of FILE: elements with standard deviations, y-parallaxes, m_q, model points.
 
     Exit code 0: all usable; 1: some pair failed; 2: bad input, nothing written.
     """
-    from . import program_store
     from .io.job import Options, run
-    from .io.tables import TableError
-
-    program_store.use(program_store.default_folder())
 
     options = Options(
         file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
     )
+    _end(lambda: run(options))
+
+
+@app.command()
+def clean(
+    file: Annotated[Path | None, given.file("Without it a simulated example with one wrong point is cleaned.")] = None,
+    procedure: Annotated[
+        str | None,
+        typer.Option(help=f"One of {', '.join(PROCEDURES)}.", metavar="NAME", show_default=False),
+    ] = None,
+    tolerance: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Another value for a number of the procedure, as often as wanted; an unknown NAME lists them.",
+            metavar="NAME=VALUE",
+            show_default=False,
+        ),
+    ] = None,
+    camera: given.Camera = None,
+    focal: given.Focal = None,
+    principal_point: given.PrincipalPoint = None,
+    pixel_size: given.PixelSize = None,
+    y_down: given.YDown = False,
+    sigma: given.Sigma = None,
+    elements: given.Elements = None,
+    base: given.Base = None,
+    residual: given.Minimised = Residual.rigorous,
+    unit: given.Unit = "mm",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for cleaned.csv (every row with its verdict), decisions.csv and decisions.json (how it came "
+            "about), and of the points kept the files of `jaxro orient`.",
+            metavar="DIR",
+            show_default=False,
+        ),
+    ] = None,
+    force: given.Force = False,
+) -> None:
+    """Find the wrong points of every pair of FILE.
+
+    Which, in what order, on what evidence; and the orientation of the points kept.
+    Exit code 0: all cleaned and usable; 1: some pair not; 2: bad input, nothing written.
+    """
+    from .io.cleaning import DEFAULT, run
+    from .io.job import Options
+
+    options = Options(
+        file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
+    )
+    _end(lambda: run(options, procedure or DEFAULT, tolerance or []))
+
+
+@app.command()
+def compare(
+    file: Annotated[
+        Path | None, given.file("Its first pair is the layout; without it sixteen points in eight rows, f = b = 70 mm.")
+    ] = None,
+    procedure: Annotated[
+        list[str] | None,
+        typer.Option(help="As often as wanted.  [default: every procedure]", metavar="NAME", show_default=False),
+    ] = None,
+    errors: Annotated[str, typer.Option(help="Numbers of wrong points.", metavar="N,N,...")] = "0,1,2,3",
+    size: Annotated[str, typer.Option(help="Sizes of their errors, in sigma.", metavar="K,K,...")] = "8,10,15",
+    trials: Annotated[int, typer.Option(help="Simulated pairs in every setting.", metavar="T")] = 1000,
+    false_alarms: Annotated[
+        float,
+        typer.Option(
+            help="Share of pairs without errors that lose a point in the comparison at equal terms; 0: without it.",
+            metavar="P",
+        ),
+    ] = 0.05,
+    seed: given.Seed = 0,
+    camera: given.Camera = None,
+    focal: given.Focal = None,
+    principal_point: given.PrincipalPoint = None,
+    pixel_size: given.PixelSize = None,
+    y_down: given.YDown = False,
+    sigma: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of the simulated coordinates, in the units of the table.  "
+            "[default: the column sigma, or sigma0 of the pair; 0.01 mm without FILE]",
+            metavar="SD",
+            show_default=False,
+        ),
+    ] = None,
+    unit: given.Unit = "mm",
+    out: Annotated[
+        Path | None, typer.Option(help="The figures in full precision.", metavar="FILE.csv", show_default=False)
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --out.")] = False,
+) -> None:
+    """Compare procedures on the layout of FILE.
+
+    By simulation: what each finds of the errors planted, and what it costs in good points.
+    Exit code 0: done; 2: bad input, nothing written.
+    """
+    from .io.job import Options
+    from .io.simulating import Wanted, run_comparison
+
+    options = Options(file, camera, focal, principal_point, pixel_size, y_down, sigma, unit=unit)
+    wanted = Wanted(procedure or [], errors, size, trials, seed, false_alarms, out, force)
+    _end(lambda: run_comparison(options, wanted))
+
+
+@app.command()
+def reproduce(
+    name: Annotated[str, typer.Argument(help=f"One of {', '.join(REPRODUCTIONS)}.", metavar="NAME")],
+    trials: Annotated[
+        int | None,
+        typer.Option(help="Simulated pairs.  [default: as many as the paper]", metavar="T", show_default=False),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the random numbers.  [default: 0]", metavar="S", show_default=False)
+    ] = None,
+) -> None:
+    """Calculate a paper's tables beside the print."""
+    from .io import simulating
+
+    _end(lambda: simulating.reproduce(name, trials, seed))
+
+
+def _end(work: Callable[[], bool]) -> None:
+    """Do the work with compiled programs kept; the exit code says how it ended."""
+    from . import program_store
+
+    program_store.use(program_store.default_folder())
     try:
-        all_usable = run(options)
+        good = work()
     except TableError as error:
         typer.secho(f"Error: {error}", err=True, fg="red")
         raise typer.Exit(2) from None
-    raise typer.Exit(0 if all_usable else 1)
+    raise typer.Exit(0 if good else 1)

@@ -1,4 +1,4 @@
-"""The files of --out: elements.csv, residuals.csv, points.csv, summary.json, in full precision, all or none.
+"""The files of --out, in full precision, all or none: elements.csv, residuals.csv, points.csv, summary.json.
 
 A number is written as its shortest text that reads back as the same float. What does not exist is an empty cell, null
 in JSON. Headers carry the units; angles are degrees.
@@ -25,17 +25,21 @@ def check_target(directory: Path, force: bool) -> None:
         raise TableError(directory, None, None, "a folder that is not empty", "a new folder, or --force to overwrite")
 
 
-def write(directory: Path, solved: list[Solution], units: Units, summary: dict[str, Any]) -> None:
-    """All four files, first complete in a folder beside `directory`, then renamed into place.
+def texts(solved: list[Solution], units: Units, summary: dict[str, Any]) -> dict[str, str]:
+    """The content of the four files by name."""
+    return {
+        "elements.csv": csv_text(_element_rows(solved, units)),
+        "residuals.csv": csv_text(_point_rows(solved, RESIDUALS, units)),
+        "points.csv": csv_text(_point_rows(solved, POINTS, units)),
+        "summary.json": _json(solved, units, summary),
+    }
+
+
+def write(directory: Path, texts: dict[str, str]) -> None:
+    """All files by name, first complete in a folder beside `directory`, then renamed into place.
 
     Raises TableError, with nothing written, where the disk refuses.
     """
-    texts = {
-        "elements.csv": _csv(_element_rows(solved, units)),
-        "residuals.csv": _csv(_point_rows(solved, RESIDUALS, units)),
-        "points.csv": _csv(_point_rows(solved, POINTS, units)),
-        "summary.json": _json(solved, units, summary),
-    }
     draft = directory.absolute().with_name(f".{directory.absolute().name}.{os.getpid()}.partial")
     try:
         draft.mkdir(parents=True)
@@ -52,6 +56,27 @@ def write(directory: Path, solved: list[Solution], units: Units, summary: dict[s
         shutil.rmtree(draft, ignore_errors=True)
 
 
+def check_file(path: Path, force: bool) -> None:
+    """Raises TableError unless a single result may be written there."""
+    if path.is_dir():
+        raise TableError(path, None, None, "a folder", "the name of a file for the result")
+    if not force and path.exists():
+        raise TableError(path, None, None, "a file that exists", "a new name, or --force to overwrite")
+
+
+def write_file(path: Path, text: str) -> None:
+    """The whole file or none. Raises TableError."""
+    draft = path.absolute().with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        draft.parent.mkdir(parents=True, exist_ok=True)
+        draft.write_text(text, encoding="utf-8", newline="")
+        os.replace(draft, path)
+    except OSError as error:
+        raise TableError(path, None, None, error.strerror or str(error), "a file that can be written") from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
 RESIDUALS = ("q", "v_x_left", "v_y_left", "v_x_right", "v_y_right", "redundancy", "in_front")
 POINTS = ("X", "Y", "Z")
 
@@ -59,8 +84,8 @@ POINTS = ("X", "Y", "Z")
 def _element_rows(solved: list[Solution], units: Units) -> list[list[Any]]:
     header: list[Any] = ["pair", "result", "points", "degrees_of_freedom", "iterations"]
     for e in solved[0].elements:
-        header += [_head(e.name, e.unit)] + ([] if e.deviation is None else [_head(f"sd_{e.name}", e.unit)])
-    rows: list[list[Any]] = [[*header, _head("m_q", units.photo), _head("sigma0", units.sigma0), "advice"]]
+        header += [head(e.name, e.unit)] + ([] if e.deviation is None else [head(f"sd_{e.name}", e.unit)])
+    rows: list[list[Any]] = [[*header, head("m_q", units.photo), head("sigma0", units.sigma0), "advice"]]
     for s in solved:
         row = [s.measured.name, s.result, len(s.measured.points), *_counts(s).values()]
         for e in s.elements:
@@ -71,13 +96,14 @@ def _element_rows(solved: list[Solution], units: Units) -> list[list[Any]]:
 
 def _point_rows(solved: list[Solution], keys: tuple[str, ...], units: Units) -> list[list[Any]]:
     unit = {"redundancy": "", "in_front": "", **dict.fromkeys(POINTS, units.model)}
-    rows: list[list[Any]] = [["pair", "point", *(_head(key, unit.get(key, units.photo)) for key in keys)]]
+    rows: list[list[Any]] = [["pair", "point", *(head(key, unit.get(key, units.photo)) for key in keys)]]
     for s in solved:
         rows += [[s.measured.name, values["point"], *(values[key] for key in keys)] for values in s.points]
     return rows
 
 
-def _head(name: str, unit: str) -> str:
+def head(name: str, unit: str) -> str:
+    """The header of a column."""
     return f"{name}_{unit}" if unit else name
 
 
@@ -90,7 +116,8 @@ def _exists(value: Any) -> bool:
     return value is not None and not (isinstance(value, float) and not math.isfinite(value))
 
 
-def _csv(rows: list[list[Any]]) -> str:
+def csv_text(rows: list[list[Any]]) -> str:
+    """Rows as CSV, the first of them the header."""
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n").writerows(
         [str(value).lower() if isinstance(value, bool) else value if _exists(value) else "" for value in row]
@@ -129,7 +156,12 @@ def _json(solved: list[Solution], units: Units, summary: dict[str, Any]) -> str:
         "units": {"photo": units.photo, "model": units.model, "sigma0": units.sigma0 or None, "angles": "deg"},
         "pairs": pairs,
     }
-    return json.dumps(_clean(whole), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return json_text(whole)
+
+
+def json_text(value: Any) -> str:
+    """The value as JSON."""
+    return json.dumps(_clean(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _clean(value: Any) -> Any:

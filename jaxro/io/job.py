@@ -1,22 +1,21 @@
-"""One call of `jaxro orient` from its options to its reports."""
+"""One call of `jaxro orient` from its options to its reports, and what other commands share with it."""
 
 import math
-import os
-import sys
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import jax
-import numpy as np
+from rich.console import Console
 
 from .. import coplanarity
+from ..batch import orient_batch
 from ..elements import AbstractElements, DependentElements, IndependentElements, RelativePose
 from ..orientation import Orientation, orient
 from ..pairs import Camera, Pair
-from . import cameras as camera_files, example, files, tables
+from . import cameras as camera_files, example, files, report, tables
+from .buckets import each
+from .console import consoles, progress
 from .solutions import Solution, Units, solutions
 from .tables import TableError
 
@@ -25,9 +24,6 @@ SYSTEMS: dict[str, type[AbstractElements]] = {
     "dependent": DependentElements,
     "independent": IndependentElements,
 }
-CHEAP = 1_000_000
-"""Padded points that take less time to calculate than another program takes to compile."""
-
 RESIDUALS = {"rigorous": coplanarity.rigorous, "parallax": coplanarity.parallax}
 
 
@@ -50,15 +46,71 @@ class Options:
     force: bool = False
 
 
-def run(options: Options) -> bool:
-    """Read, orient, write, show. True if every pair is usable. Raises TableError, with nothing written."""
-    from rich.console import Console
+class Example(NamedTuple):
+    """What is worked on where the user names no file."""
 
+    name: str
+    focal: float
+    table: str
+
+
+MEASURED = Example(example.NAME, example.FOCAL, example.TABLE)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a command works on, read and checked."""
+
+    options: Options
+    table: tables.Table
+    cameras: list[tuple[Camera, Camera]]
+    pairs: list[Pair]
+    system: type[AbstractElements]
+    units: Units
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """The options of `jaxro.orient` and `jaxro.orient_batch`."""
+        return {
+            "elements": self.system,
+            "base": self.options.base,
+            "residual": RESIDUALS[self.options.residual],
+        }
+
+    @property
+    def sigma_known(self) -> bool:
+        """Whether the standard deviation of the coordinates is given."""
+        return self.table.has_sigma or self.options.sigma is not None
+
+    @property
+    def system_name(self) -> str:
+        """The system by its name on the command line."""
+        return next(name for name, known in SYSTEMS.items() if known is self.system)
+
+    def summary(self, solved: list[Solution]) -> dict[str, Any]:
+        """What summary.json says of all pairs together."""
+        from .. import __version__
+
+        return {
+            "program": f"jaxro {__version__}",
+            "file": self.table.file,
+            "elements": self.system_name,
+            "residual": self.options.residual,
+            "base": self.options.base,
+            "sigma": self.options.sigma,
+            "usable": sum(s.usable for s in solved),
+            "failed": sum(not s.usable for s in solved),
+            "warnings": self.table.warnings,
+        }
+
+
+def prepared(options: Options, otherwise: Example = MEASURED) -> Job:
+    """Everything read and checked, the target of --out as well. Raises TableError."""
     if options.out is not None:
         files.check_target(options.out, options.force)
     system = SYSTEMS[options.elements or ("relative" if options.file else "dependent")]
-    table = read_table(options)
-    cameras = read_cameras(options, table)
+    table = read_table(options, otherwise)
+    cameras = read_cameras(options, table, otherwise)
     _check_numbers(options, table, system)
     pairs = [
         camera_files.to_pair(measured, table.file, *both, options.sigma)
@@ -69,28 +121,57 @@ def run(options: Options) -> bool:
         model="bases" if system is RelativePose else options.unit if options.base is None else "base_units",
         sigma0="" if table.has_sigma or options.sigma is not None else options.unit,
     )
-    # text that goes to a file or a pipe is not wrapped at 80 columns
-    wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200
-    console = Console(width=wide, highlight=False)
-    errors = Console(stderr=True, highlight=False)
-    for warning in table.warnings:
-        errors.print(f"Warning: {warning}", style="yellow", markup=False)
-    keywords = {"elements": system, "base": options.base, "residual": RESIDUALS[options.residual]}
-    solved = solutions(table.pairs, cameras, _with_progress(errors, pairs, keywords), units)
-    if options.out is not None:
-        files.write(options.out, solved, units, _summary(options, table, system, solved))
-    _show(console, options, solved, units, system)
+    return Job(options, table, cameras, pairs, system, units)
+
+
+def run(options: Options) -> bool:
+    """Read, orient, write, show. True if every pair is usable. Raises TableError, with nothing written."""
+    job = prepared(options)
+    console, errors = consoles()
+    warn(errors, job)
+    with progress(errors, "Orienting", len(job.pairs)) as told:
+        oriented = orient_all(job.pairs, job.keywords, told)
+    solved = solutions(job.table.pairs, job.cameras, oriented, job.units)
+    texts = {} if options.out is None else files.texts(solved, job.units, job.summary(solved))
+    write(job, texts)
+    show(console, job, solved)
+    tell(console, job, texts)
+    if options.file is None:
+        console.print("This was the embedded example. Your own pairs: jaxro orient FILE.csv --focal F", markup=False)
     return all(s.usable for s in solved)
 
 
-def read_table(options: Options) -> tables.Table:
+def warn(errors: Console, job: Job) -> None:
+    """What a careful reader of the table should be told."""
+    for warning in job.table.warnings:
+        errors.print(f"Warning: {warning}", style="yellow", markup=False)
+
+
+def write(job: Job, texts: dict[str, str]) -> None:
+    """The files of --out, if it was asked for. Raises TableError."""
+    if job.options.out is not None:
+        files.write(job.options.out, texts)
+
+
+def tell(console: Console, job: Job, texts: dict[str, str]) -> None:
+    """Where the files are."""
+    if job.options.out is not None:
+        console.print(f"Written to {job.options.out}: {', '.join(texts)}", markup=False)
+
+
+def show(console: Console, job: Job, solved: list[Solution]) -> None:
+    """The orientations on the terminal."""
+    report.show(console, solved, job.units, f"{job.system_name} elements, {job.options.residual} residuals")
+
+
+def read_table(options: Options, otherwise: Example) -> tables.Table:
     """The pairs of the file, or the example."""
     if options.file is None:
-        return tables.parse(example.TABLE, example.NAME, example.NAME)
+        return tables.parse(otherwise.table, otherwise.name, otherwise.name)
     return tables.read(options.file)
 
 
-def read_cameras(options: Options, table: tables.Table) -> list[tuple[Camera, Camera]]:
+def read_cameras(options: Options, table: tables.Table, otherwise: Example) -> list[tuple[Camera, Camera]]:
     """(left, right) camera of every pair, from --camera or from the single options."""
     single = {
         "--focal": options.focal,
@@ -104,9 +185,9 @@ def read_cameras(options: Options, table: tables.Table) -> list[tuple[Camera, Ca
                 raise TableError(name, None, None, "it beside --camera", f"this entry in {options.camera} instead")
         known = camera_files.read(options.camera)
         return [known.of(measured, table.file) for measured in table.pairs]
-    focal = example.FOCAL if options.file is None and options.focal is None else options.focal
+    focal = otherwise.focal if options.file is None and options.focal is None else options.focal
     if focal is None:
-        expected = f"the focal length of the photos, --focal {example.FOCAL} or --camera camera.toml"
+        expected = f"the focal length of the photos, --focal {otherwise.focal} or --camera camera.toml"
         raise TableError("--focal", None, None, "neither --focal nor --camera", expected)
     for name, value in (("--focal", focal), ("--pixel-size", options.pixel_size)):
         if value is not None and not (math.isfinite(value) and value > 0):
@@ -141,84 +222,10 @@ def orient_all(pairs: list[Pair], keywords: dict[str, Any], progress: Callable[[
 
     `progress` is told the number of pairs finished so far.
     """
-    if len(pairs) == 1:
-        one = jax.tree.map(np.asarray, orient(pairs[0], **keywords))
-        progress(1)
-        return [one]
-    from ..batch import orient_batch
-
-    out: list[Any] = [None] * len(pairs)
-    finished = 0
-    for size, members in buckets([len(pair.x_left) for pair in pairs]).items():
-        batch = _batch([pairs[i] for i in members], size)
-        told = lambda done, total, before=finished: progress(before + done)
-        solved = jax.tree.map(np.asarray, orient_batch(batch, progress=told, **keywords))
-        for row, i in enumerate(members):
-            out[i] = jax.tree.map(lambda a, row=row: a[row], solved)
-        finished += len(members)
-    return out
-
-
-def buckets(lengths: list[int]) -> dict[int, list[int]]:
-    """Indices of the pairs to be padded to each number of points, a power of two of at least 8.
-
-    A few short pairs go along with longer ones: calculating with their padding is cheaper than compiling once more.
-    """
-    exact: dict[int, list[int]] = defaultdict(list)
-    for i, length in enumerate(lengths):
-        exact[max(8, 1 << (length - 1).bit_length())].append(i)
-    out: dict[int, list[int]] = {}
-    size = 0
-    for own in sorted(exact, reverse=True):
-        if not out or len(exact[own]) * size > CHEAP:
-            size = own
-        out.setdefault(size, []).extend(exact[own])
-    return out
-
-
-def _batch(pairs: list[Pair], size: int) -> Pair:
-    """`jaxro.stack` padded to `size`, in NumPy: thousands of lengths, nothing to compile."""
-    fitted = lambda field: np.pad(field, (0, size - len(field))) if field.ndim else field
-    return jax.tree.map(lambda *fields: np.stack([fitted(field) for field in fields]), *pairs)
-
-
-def _with_progress(errors, pairs: list[Pair], keywords: dict[str, Any]) -> list[Orientation]:
-    """`orient_all` with a progress bar for many pairs, where somebody can see it."""
-    if len(pairs) < 2 or not errors.is_terminal:
-        return orient_all(pairs, keywords, lambda done: None)
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = TextColumn("Orienting"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=errors, transient=True) as bar:
-        task = bar.add_task("", total=len(pairs))
-        return orient_all(pairs, keywords, lambda done: bar.update(task, completed=done))
-
-
-def _summary(
-    options: Options, table: tables.Table, system: type[AbstractElements], solved: list[Solution]
-) -> dict[str, Any]:
-    from .. import __version__
-
-    return {
-        "program": f"jaxro {__version__}",
-        "file": table.file,
-        "elements": next(name for name, known in SYSTEMS.items() if known is system),
-        "residual": options.residual,
-        "base": options.base,
-        "sigma": options.sigma,
-        "usable": sum(s.usable for s in solved),
-        "failed": sum(not s.usable for s in solved),
-        "warnings": table.warnings,
-    }
-
-
-def _show(console, options: Options, solved: list[Solution], units: Units, system: type[AbstractElements]) -> None:
-    from . import report
-
-    name = next(name for name, known in SYSTEMS.items() if known is system)
-    report.show(console, solved, units, f"{name} elements, {options.residual} residuals")
-    if options.out is not None:
-        written = "elements.csv, residuals.csv, points.csv, summary.json"
-        console.print(f"Written to {options.out}: {written}", markup=False)
-    if options.file is None:
-        console.print("This was the embedded example. Your own pairs: jaxro orient FILE.csv --focal F", markup=False)
+    found = each(
+        pairs,
+        lambda pair: orient(pair, **keywords),
+        lambda batch, told: orient_batch(batch, progress=told, **keywords),
+        progress,
+    )
+    return [orientation for _, orientation in sorted(found, key=lambda entry: entry[0])]

@@ -5,9 +5,14 @@ is the one list of them.
 """
 
 from .base import OUTCOMES as OUTCOMES, AbstractProcedure as AbstractProcedure, Log as Log, Rejection as Rejection
+from .all_subsets import AllSubsets as AllSubsets
+from .data_snooping import DataSnooping as DataSnooping
 from .dorozhinsky import Dorozhinsky as Dorozhinsky
+from .graduated_non_convexity import GraduatedNonConvexity as GraduatedNonConvexity
 from .leave_one_out_grubbs import LeaveOneOutGrubbs as LeaveOneOutGrubbs, calibrated as calibrated
 from .mean_parallax import MeanParallax as MeanParallax
+from .ransac import Ransac as Ransac
+from .recommended import Recommended as Recommended
 from .three_sigma import ThreeSigma as ThreeSigma
 from .two_stage import TwoStage as TwoStage
 from .worst_point import WorstPoint as WorstPoint
@@ -19,5 +24,10 @@ PROCEDURES: dict[str, AbstractProcedure] = {
     "dorozhinsky": Dorozhinsky(),
     "grubbs": LeaveOneOutGrubbs(),
     "two-stage": TwoStage(),
+    "data-snooping": DataSnooping(),
+    "tau": DataSnooping(estimated=True),
+    "graduated": GraduatedNonConvexity(),
+    "all-subsets": AllSubsets(),
+    "recommended": Recommended(),
 }
 """Every procedure by its name on the command line, with the tolerances of its source."""

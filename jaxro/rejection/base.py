@@ -31,6 +31,10 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "at this pair."
     )
     nothing_to_test = "The procedure does not apply: too few points to reject any."
+    no_consensus = (
+        "No orientation was found that so many points agree with that it cannot be an accident. Measure more points, or "
+        "give the standard deviation of the coordinates."
+    )
     not_oriented = "The points that were kept do not orient the pair; see the result of its orientation."
 
 

@@ -5,14 +5,13 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..elements import RelativePose
-from ..orientation import orient
 from ..pairs import Pair, cleaned
 from ..starts import AbstractStart, Vertical
-from .base import AbstractProcedure, Rejection, Round, began, ended, finished, independent, recorded
-from .robust import agreeing, at, normalised, reweighted, scaled
+from .base import Rejection
+from .robust import AbstractSearch, agreeing, at, in_single, judged, reweighted, scaled
 
 
-class GraduatedNonConvexity(AbstractProcedure):
+class GraduatedNonConvexity(AbstractSearch):
     """Minimise Σ min(s, c²), s = (r/sigma)², c = `limit`, from absolute residuals over a loss that slowly lets go.
 
     `absolute` steps with weights 1/|r|; `graded` steps of Geman-McClure, weight (k²/(k² + s))², its k falling from
@@ -30,39 +29,24 @@ class GraduatedNonConvexity(AbstractProcedure):
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
-        begin = self.start(lax.stop_gradient(pair)).pose
-        pose, use = self.search(lax.stop_gradient(pair), begin)
-        linear = at(pair, pose)
-        w = normalised(linear, use)
-        solved = orient(pair.with_mask(use), start=pose)
-        new = Round(
-            jnp.where(pair.mask, w, 0.0),
-            jnp.asarray(self.limit),
-            pair.mask & ~use,
-            solved.parallax,
-            independent(solved.pose),
-        )
-        return ended(recorded(began(pair, 1), new), solved, finished(pair))
+        fixed = lax.stop_gradient(pair)
+        pose = self.search(fixed)
+        use = fixed.mask & (at(fixed, pose).squares <= self.limit**2)
+        return judged(pair, *agreeing(fixed, pose, use, self.limit, self.rounds), self.limit)
 
-    def search(self, pair: Pair, pose: RelativePose):
-        """The pose and the points that agree with it."""
-        single = _with_dtype(jnp.float32, pair)
-        pose = _with_dtype(jnp.float32, pose)
+    def search(self, pair: Pair) -> RelativePose:
+        """The pose after all graded steps, which are as good in single precision."""
+        single = in_single(pair)
 
         def absolute(_, pose):
             return reweighted(single, pose, lambda s: 1 / jnp.sqrt(s + 1))
 
         def graded(i, pose):
-            share = i / max(self.graded - 1, 1)
-            k2 = jnp.asarray(self.widest**2, jnp.float32) * (self.limit / self.widest) ** (2 * share)
+            share = i.astype(jnp.float32) / max(self.graded - 1, 1)
+            k2 = self.widest**2 * (self.limit / self.widest) ** (2 * share)
             return reweighted(single, pose, lambda s: (k2 / (k2 + s)) ** 2)
 
+        pose = in_single(self.start(pair).pose)
         pose = lax.fori_loop(0, self.absolute, absolute, pose)
-        pose = lax.fori_loop(0, self.graded, lambda i, p: graded(i.astype(jnp.float32), p), pose)
-        pose = _with_dtype(pair.focal_left.dtype, pose).normalised()
-        use = pair.mask & (at(pair, pose).squares <= self.limit**2)
-        return agreeing(pair, pose, use, self.limit, self.rounds)
-
-
-def _with_dtype(dtype, tree):
-    return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, tree)
+        pose = lax.fori_loop(0, self.graded, graded, pose)
+        return jax.tree.map(lambda a: a.astype(pair.focal_left.dtype), pose).normalised()

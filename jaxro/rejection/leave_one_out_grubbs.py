@@ -11,6 +11,7 @@ from ..elements import AbstractElements
 from ..normal_equations import accumulate, cholesky, substitute
 from ..orientation import orient
 from ..pairs import Pair, cleaned
+from ..programs import stage
 from ..reductions import count, total
 from ..simulation import noisy, planted
 from .base import (
@@ -61,17 +62,22 @@ def closed_form(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElemen
 
     It differs from `refitted` where a point has much leverage or the elements change by much.
     """
-    q, columns, redundancy = linearised(pair, mask, elements)
-    testable = mask & (redundancy > UNTESTABLE)
-    a, z = columns
-    factor = jnp.where(testable, q / jnp.where(testable, redundancy, 1.0), 0.0)
 
-    def one(index, change, *solved):
-        moved = q + change * sum(column * s for column, s in zip(a, solved, strict=True))
-        others = mask & (jnp.arange(q.shape[0]) != index)
-        return total(jnp.where(others, jnp.abs(moved), 0.0)) / jnp.maximum(count(mask), 1.0)
+    def shared(pair, mask, elements):
+        q, (a, z), redundancy = linearised(pair, mask, elements)
+        testable = mask & (redundancy > UNTESTABLE)
+        factor = jnp.where(testable, q / jnp.where(testable, redundancy, 1.0), 0.0)
+        return q, a, [factor * column for column in z], testable
 
-    return jax.vmap(one)(jnp.arange(q.shape[0]), factor, *z), testable
+    q, a, change, testable = stage(shared)(pair, mask, elements)
+
+    def one(own, *change):
+        moved = q + sum(column * c for column, c in zip(a, change, strict=True))
+        # a point not in use has q = a = 0
+        return (total(jnp.abs(moved)) - own) / jnp.maximum(count(mask), 1.0)
+
+    own = jnp.abs(q + sum(x * y for x, y in zip(a, change, strict=True)))
+    return jax.vmap(one)(own, *change), testable
 
 
 def linearised(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements):

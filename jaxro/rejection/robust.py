@@ -1,17 +1,21 @@
 """Steps of reweighted Gauss-Newton on the distances of the points, and the set of points that agree with a pose."""
 
+import abc
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .. import coplanarity
 from ..adjustment import Residuals
 from ..elements import RelativePose
 from ..normal_equations import accumulate, cholesky, solve, substitute
+from ..orientation import orient
 from ..pairs import Pair
+from ..reductions import count
+from .base import AbstractProcedure, Rejection, Round, began, ended, finished, independent, recorded
 
 Values = Float[Array, "point"]
 Use = Bool[Array, "point"]
@@ -28,6 +32,28 @@ class Linear(NamedTuple):
     def squares(self) -> Values:
         """(r / sigma)² of the points."""
         return self.weight * self.g * self.g
+
+
+class AbstractSearch(AbstractProcedure):
+    """A procedure that finds the pose first, and the wrong points by it."""
+
+    @abc.abstractmethod
+    def search(self, pair: Pair) -> RelativePose:
+        """A pose near the right one, in spite of the wrong points."""
+
+
+def judged(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike) -> Rejection:
+    """The verdict that only `use` are right, with the evidence |w| against the limit and the orientation of them."""
+    solved = orient(pair.with_mask(use), start=pose)
+    w = jnp.where(pair.mask, normalised(at(pair, solved.pose), use), 0.0)
+    limit = jnp.asarray(limit, w.dtype)
+    new = Round(w, limit, pair.mask & ~use, solved.parallax, independent(solved.pose))
+    return ended(recorded(began(pair, 1), new), solved, finished(pair))
+
+
+def in_single(tree: PyTree) -> PyTree:
+    """The tree with its floating-point numbers in single precision."""
+    return jax.tree.map(lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, tree)
 
 
 def scaled(pair: Pair, sigma: float | None) -> Pair:
@@ -75,12 +101,27 @@ def normalised(linear: Linear, use: Use) -> Values:
     n, _, _ = accumulate([linear.g], [[c] for c in linear.columns], [weight])
     z = substitute(cholesky(n)[0], linear.columns)
     h = linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True))
+    h = jnp.where(jnp.isfinite(h), h, 1.0)
     variance = jnp.where(use, jnp.maximum(1 - h, 1e-6), 1 + h)
     return jnp.sqrt(linear.squares / variance)
 
 
-def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: float, rounds: int) -> tuple[RelativePose, Use]:
+def in_front(pair: Pair, pose: RelativePose) -> Use:
+    """The points in front of both photos, with the sign of the base that most of them ask for."""
+    rotation, base = pose.relative()
+
+    def depths(point):
+        return coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)[3:]
+
+    lam, mu = jax.vmap(depths)(pair.coordinates)
+    front, behind = pair.mask & (lam > 0) & (mu > 0), pair.mask & (lam < 0) & (mu < 0)
+    return jnp.where(count(front) >= count(behind), front, behind)
+
+
+def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int) -> tuple[RelativePose, Use]:
     """The pose of the points with |w| <= limit, found in turns: solve, judge every point anew."""
+
+    limit = jnp.asarray(limit, pair.sigma.dtype)
 
     def turn(_, state):
         pose, use = state
@@ -89,3 +130,29 @@ def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: float, rounds: int
         return pose, pair.mask & (normalised(at(pair, pose), use) <= limit)
 
     return jax.lax.fori_loop(0, rounds, turn, (pose, use))
+
+
+def one_by_one(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int):
+    """(pose, points) near the least Σ (r/sigma)² over the points in use + limit² (points rejected), and that sum.
+
+    In each round the one point changes sides that lowers the sum most: out, by w² - limit², or in, by limit² - w².
+    """
+    cut = jnp.asarray(limit, pair.sigma.dtype) ** 2
+
+    def solved(pose, use):
+        linear = at(pair, pose)
+        return stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
+
+    def turn(_, state):
+        pose, use = state
+        pose = solved(pose, use)
+        gain = normalised(at(pair, pose), use) ** 2 - cut
+        gain = jnp.where(pair.mask, jnp.where(use, gain, -gain), 0.0)
+        best = jnp.max(gain)
+        return pose, use ^ ((gain == best) & (best > 0))
+
+    pose, use = jax.lax.fori_loop(0, rounds, turn, (pose, use))
+    pose = solved(pose, use)
+    squares = at(pair, pose).squares
+    cost = jnp.sum(jnp.where(pair.mask, jnp.where(use, squares, cut), 0.0))
+    return (pose, use), jnp.where(jnp.isfinite(cost), cost, jnp.inf)

@@ -1,0 +1,68 @@
+"""A comparison of procedures as tables."""
+
+from collections.abc import Iterator
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+from .calibration import Calibration
+from .compare import Comparison, Estimate, Score
+from .tables import number, table
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def tables(comparison: Comparison) -> "Iterator[str | Table]":
+    """What `jaxro compare` prints: for every layout the procedures as they are, then at equal false alarms."""
+    for layout, scores in groupby(comparison.scores, key=lambda s: s.setting.layout):
+        here = list(scores)
+        yield f"{layout}, {here[0].trials} pairs a row; % of points or pairs ± standard error; angle to the truth, rms"
+        yield from _both([s for s in here if not s.calibrated])
+        if comparison.false_alarms:
+            share = f"{100 * comparison.false_alarms:g} %"
+            yield f"{layout}, every procedure set so that {share} of the pairs without errors lose a point"
+            yield _set(comparison.calibrations[layout])
+            yield from _both([s for s in here if s.calibrated])
+
+
+def _both(scores: list[Score]) -> "Iterator[Table]":
+    clean, spoiled = ([s for s in scores if bool(s.setting.errors) == wrong] for wrong in (False, True))
+    if clean:
+        yield _clean(clean)
+    if spoiled:
+        yield _spoiled(spoiled)
+
+
+def _clean(scores: list[Score]) -> "Table":
+    rows = table("no errors", "false alarms", "good lost", "unfinished", "angle [']")
+    for s in scores:
+        rows.add_row(s.procedure, *map(_percent, (s.alarms, s.lost, s.unfinished)), _angle(s))
+    return rows
+
+
+def _spoiled(scores: list[Score]) -> "Table":
+    rows = table("errors", "procedure", "found", "good lost", "all right", "unfinished", "angle [']", left=2)
+    for setting, members in groupby(scores, key=lambda s: s.setting):
+        rows.add_section()
+        title = f"{setting.errors} x {setting.size:g}σ"
+        for s in members:
+            shares = map(_percent, (s.found, s.lost, s.perfect, s.unfinished))
+            rows.add_row(title, s.procedure, *shares, _angle(s))
+            title = ""
+    return rows
+
+
+def _set(calibrations: dict[str, Calibration]) -> "Table":
+    rows = table("procedure", "set to", left=2)
+    for name, c in calibrations.items():
+        rows.add_row(name, c.reason or f"{c.name} = {c.value:.3g}")
+    return rows
+
+
+def _percent(e: Estimate) -> str:
+    exists = e.value == e.value
+    return f"{number(100 * e.value, 1)} ±{number(100 * e.error, 1)}" if exists else "-"
+
+
+def _angle(s: Score) -> str:
+    return f"{number(s.angle.value, 2)} ±{number(s.angle.error, 2)}"

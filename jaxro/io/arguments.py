@@ -1,0 +1,88 @@
+"""What several commands accept on the command line: one annotated type an argument."""
+
+import enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class System(enum.StrEnum):
+    """Elements by the names of the command line."""
+
+    relative = "relative"
+    dependent = "dependent"
+    independent = "independent"
+
+
+class Residual(enum.StrEnum):
+    """Residuals by the names of the command line."""
+
+    rigorous = "rigorous"
+    parallax = "parallax"
+
+
+COLUMNS = (
+    "CSV table with the columns point,x_left,y_left,x_right,y_right (or id,xl,yl,xr,yr) and optionally pair, sigma."
+)
+
+
+def file(otherwise: str) -> typer.models.ArgumentInfo:
+    """The table; `otherwise`: what is done without one."""
+    return typer.Argument(help=f"{COLUMNS} {otherwise}", metavar="FILE.csv", show_default=False)
+
+
+Camera = Annotated[
+    Path | None,
+    typer.Option(
+        help="[camera], or [left] and [right], or [photo.NAME] for pairs named LEFT-RIGHT or LEFT_RIGHT; "
+        "keys focal, principal_point, pixel_size, y_down.",
+        metavar="FILE.toml",
+        show_default=False,
+    ),
+]
+Focal = Annotated[
+    float | None, typer.Option(help="Focal length in photo units, of both photos.", metavar="F", show_default=False)
+]
+PrincipalPoint = Annotated[
+    tuple[float, float] | None,
+    typer.Option(
+        help="Principal point x y, in the units of the table.  [default: 0 0]", metavar="X Y", show_default=False
+    ),
+]
+PixelSize = Annotated[
+    float | None,
+    typer.Option(
+        help="Photo units per unit of the table, e.g. mm per pixel.  [default: 1]", metavar="SIZE", show_default=False
+    ),
+]
+YDown = Annotated[bool, typer.Option("--y-down", help="y of the table counts downwards.")]
+Sigma = Annotated[
+    float | None,
+    typer.Option(
+        help="Standard deviation of every coordinate before the adjustment, in the units of the table; "
+        "sigma0 is then a ratio to it.",
+        metavar="SD",
+        show_default=False,
+    ),
+]
+Elements = Annotated[
+    System | None,
+    typer.Option(
+        help="System of elements.  [default: relative, which exists for photos in any position; "
+        "dependent for the example]",
+        show_default=False,
+    ),
+]
+Base = Annotated[
+    float | None,
+    typer.Option(
+        help="bx of the dependent, b of the independent system: the scale of the model.  [default: mean x-parallax]",
+        metavar="B",
+        show_default=False,
+    ),
+]
+Minimised = Annotated[Residual, typer.Option(help="What is minimised: whitened conditions, or strict y-parallaxes.")]
+Unit = Annotated[str, typer.Option(help="Name of the photo unit in reports: mm, px.", metavar="NAME")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite the files in a folder that is not empty.")]
+Seed = Annotated[int, typer.Option(help="Seed of the random numbers.", metavar="S")]

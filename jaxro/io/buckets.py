@@ -1,0 +1,74 @@
+"""Pairs of every length in few batches: padded to a power of two, so that few programs are compiled."""
+
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from ..pairs import Pair
+
+CHEAP = 1_000_000
+"""Padded points that take less time to calculate than another program takes to compile."""
+
+
+def each(
+    pairs: list[Pair],
+    one: Callable[[Pair], PyTree],
+    many: Callable[[Pair, Callable[[int, int], None]], PyTree],
+    progress: Callable[[int], None],
+    most: Callable[[int], int] = lambda size: sys.maxsize,
+) -> Iterator[tuple[int, PyTree]]:
+    """(index of the pair, its result in NumPy): one(pair) of a single pair, many(batch, progress) of several.
+
+    Not in order, and padded. `most(points)`: pairs of so many points that go together at most.
+    """
+    if len(pairs) == 1:
+        found = jax.tree.map(np.asarray, one(pairs[0]))
+        progress(1)
+        yield 0, found
+        return
+    finished = 0
+    for size, members in buckets([len(pair.x_left) for pair in pairs]).items():
+        step = min(len(members), most(size))
+        for begin in range(0, len(members), step):
+            part = members[begin : begin + step]
+            batch = _batch([pairs[i] for i in part], size)
+            told = lambda done, total, before=finished: progress(min(before + done, len(pairs)))
+            found = jax.tree.map(np.asarray, many(_filled(batch, step), told))
+            finished += len(part)
+            for row, i in enumerate(part):
+                yield i, jax.tree.map(lambda a, row=row: a[row], found)
+
+
+def buckets(lengths: list[int]) -> dict[int, list[int]]:
+    """Indices of the pairs to be padded to each number of points, a power of two of at least 8.
+
+    A few short pairs go along with longer ones: calculating with their padding is cheaper than compiling once more.
+    """
+    exact: dict[int, list[int]] = defaultdict(list)
+    for i, length in enumerate(lengths):
+        exact[max(8, 1 << (length - 1).bit_length())].append(i)
+    out: dict[int, list[int]] = {}
+    size = 0
+    for own in sorted(exact, reverse=True):
+        if not out or len(exact[own]) * size > CHEAP:
+            size = own
+        out.setdefault(size, []).extend(exact[own])
+    return out
+
+
+def _batch(pairs: list[Pair], size: int) -> Pair:
+    """`jaxro.stack` padded to `size`, in NumPy: thousands of lengths, nothing to compile."""
+    fitted = lambda field: np.pad(field, (0, size - len(field))) if field.ndim else field
+    return jax.tree.map(lambda *fields: np.stack([fitted(field) for field in fields]), *pairs)
+
+
+def _filled(batch: Pair, count: int) -> Pair:
+    """The batch with empty pairs up to `count`: no program for the rest."""
+    missing = count - len(batch.x_left)
+    if not missing:
+        return batch
+    return jax.tree.map(lambda a: np.concatenate([a, np.zeros((missing, *a.shape[1:]), a.dtype)]), batch)

@@ -1,0 +1,120 @@
+"""One call of `jaxro clean`: wrong points found, the rest oriented, both told and written."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from .. import coplanarity
+from ..batch import clean_batch, orient_batch
+from ..elements import AbstractElements
+from ..orientation import Orientation, orient
+from ..pairs import Pair
+from ..programs import QUICK, Program
+from ..rejection import PROCEDURES, AbstractProcedure, Rejection
+from . import files, job as jobs, mock_example, verdict_report, verdicts as judged
+from .buckets import each
+from .console import consoles, progress
+from .job import Example, Job, Options
+from .solutions import solutions
+from .tables import TableError
+from .tolerances import changed, judges_by_sigma, tolerances
+from .verdicts import Verdict
+
+DEFAULT = "recommended" if "recommended" in PROCEDURES else "two-stage"
+"""The procedure of users who name none."""
+
+SIMULATED = Example(mock_example.NAME, mock_example.FOCAL, mock_example.TABLE)
+
+LOG_NUMBERS = 4_000_000
+"""Entries of the log, (pair, round, point), that may be in memory at once: some 100 MB."""
+
+
+def run(options: Options, name: str, changes: list[str]) -> bool:
+    """Read, clean, orient, write, show. True if every pair is cleaned and usable. Raises TableError."""
+    procedure = changed(named(name), changes)
+    job = jobs.prepared(options, SIMULATED)
+    if judges_by_sigma(procedure) and not job.sigma_known:
+        expected = f"the standard deviation of a coordinate, by which {name} judges, or a column sigma in the table"
+        raise TableError("--sigma", None, None, "neither --sigma nor a column sigma", expected)
+    console, errors = consoles()
+    jobs.warn(errors, job)
+    with progress(errors, "Cleaning", len(job.pairs)) as told:
+        verdicts, oriented = clean_all(job, procedure, told)
+    # where nothing is left, every row stands with its failure
+    measured = [v.kept if v.kept.points else v.measured for v in verdicts]
+    solved = solutions(measured, job.cameras, oriented, job.units)
+    verdicts = [v if s.usable else v.without_parallax() for v, s in zip(verdicts, solved, strict=True)]
+    texts: dict[str, str] = {}
+    if options.out is not None:
+        summary = job.summary(solved)
+        heading = {"program": summary["program"], "file": summary["file"], "procedure": name}
+        texts = judged.texts(verdicts, job.units.photo, heading | {"tolerances": tolerances(procedure)})
+        texts |= files.texts(solved, job.units, summary)
+    jobs.write(job, texts)
+    verdict_report.show(console, verdicts, name, job.units.photo)
+    jobs.show(console, job, solved)
+    jobs.tell(console, job, texts)
+    if options.file is None:
+        console.print("This was a simulated example. Your own pairs: jaxro clean FILE.csv --focal F", markup=False)
+    return all(v.finished and s.usable for v, s in zip(verdicts, solved, strict=True))
+
+
+def named(name: str) -> AbstractProcedure:
+    """The procedure of this name. Raises TableError."""
+    if name not in PROCEDURES:
+        raise TableError("--procedure", None, None, repr(name), f"one of {', '.join(PROCEDURES)}")
+    return PROCEDURES[name]
+
+
+def clean_all(
+    job: Job, procedure: AbstractProcedure, told: Callable[[int], None]
+) -> tuple[list[Verdict], list[Orientation]]:
+    """The verdict on every pair, with the log if files are asked for, and the orientation of the points kept."""
+    select = judged.without_log if job.options.out is None else judged.with_log
+
+    def one(pair: Pair):
+        found, log = Program(_decided, {"procedure": procedure, "select": select}, QUICK)(pair)
+        oriented = orient(pair.with_mask(found.kept), **job.keywords)
+        return found, log, oriented, Program(_parallaxes, {}, QUICK)((pair, oriented.pose))
+
+    def many(batch: Pair, progress: Callable[[int, int], None]):
+        found, log = clean_batch(batch, procedure, select=select, progress=progress)
+        oriented = orient_batch(batch.with_mask(found.kept), **job.keywords)
+        return found, log, oriented, Program(_all_parallaxes, {})((batch, oriented.pose))
+
+    together = (lambda points: 1 << 40) if job.options.out is None else lambda points: max(1, LOG_NUMBERS // points**2)
+    verdicts: dict[int, Verdict] = {}
+    oriented: dict[int, Orientation] = {}
+    for i, (found, log, orientation, parallax) in each(job.pairs, one, many, told, together):
+        verdicts[i] = judged.verdict(job.table.pairs[i], found, parallax, log)
+        oriented[i] = _of_points(orientation, np.flatnonzero(found.kept))
+    every = range(len(job.pairs))
+    return [verdicts[i] for i in every], [oriented[i] for i in every]
+
+
+def _decided(pair: Pair, *, procedure: AbstractProcedure, select: Callable[[Rejection], tuple]) -> tuple:
+    return select(procedure(pair))
+
+
+def _parallaxes(pair_and_pose: tuple[Pair, AbstractElements]) -> Float[Array, "point"]:
+    """q of all points of a pair at its orientation, whether they took part in it or not."""
+    pair, pose = pair_and_pose
+    rows = tuple(frame[1:] for frame in coplanarity.turned(pose))
+    return jax.vmap(lambda point: coplanarity.y_parallax(rows, point, pair.focal_left, pair.focal_right))(
+        pair.coordinates
+    )
+
+
+def _all_parallaxes(pairs_and_poses: tuple[Pair, AbstractElements]) -> Float[Array, "pair point"]:
+    return jax.vmap(_parallaxes)(pairs_and_poses)
+
+
+def _of_points(orientation: Orientation, places: np.ndarray) -> Orientation:
+    """The orientation with the values of these points only."""
+    if not places.size:
+        return orientation
+    values = lambda o: (o.parallax, o.residuals, o.corrections, o.redundancy, o.model, o.in_front)
+    return eqx.tree_at(values, orientation, jax.tree.map(lambda a: a[places], values(orientation)))

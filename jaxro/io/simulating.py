@@ -1,0 +1,177 @@
+"""One call of `jaxro reproduce` or `jaxro compare`."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .. import simulation
+from ..experiments import REPRODUCTIONS
+from ..experiments.compare import Comparison, compare
+from ..experiments.compare_tables import tables
+from ..orientation import orient
+from ..pairs import Pair
+from ..rejection import PROCEDURES
+from . import files, job as jobs
+from .cleaning import named
+from .console import consoles, progress
+from .job import Options
+from .solutions import ADVICE, NAMES
+from .tables import TableError
+
+SIGMA = 0.01
+"""mm, of the standard layout, as in the papers."""
+LEAST = 6
+"""Good points that a pair has at least."""
+
+T = TypeVar("T", int, float)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What to compare; lists as they were written, 0,1,2,3."""
+
+    procedures: list[str]
+    errors: str
+    sizes: str
+    trials: int
+    seed: int
+    false_alarms: float
+    out: Path | None
+    force: bool
+
+
+def reproduce(name: str, trials: int | None, seed: int | None) -> bool:
+    """Calculate and show an experiment of a paper. Raises TableError."""
+    if name not in REPRODUCTIONS:
+        raise TableError("NAME", None, None, repr(name), f"one of {', '.join(REPRODUCTIONS)}")
+    experiment = REPRODUCTIONS[name]
+    for option, value in (("--trials", trials), ("--seed", seed)):
+        if value is not None and not experiment.random:
+            raise TableError(option, None, None, f"it with {name}", "no such option: nothing is random there")
+    _check_trials(trials)
+    console, errors = consoles()
+    with progress(errors, "Calculating", None if experiment.random else 1) as told:
+        random = (experiment.trials if trials is None else trials, seed or 0, told)
+        results = experiment.run(*random) if experiment.random else experiment.run()
+    for part in experiment.tables(results):
+        console.print(part, markup=False)
+    return True
+
+
+def run_comparison(options: Options, wanted: Wanted) -> bool:
+    """Compare procedures on the layout of the first pair of the file, or the standard one. Raises TableError."""
+    procedures = {name: named(name) for name in wanted.procedures or PROCEDURES}
+    errors = _numbers("--errors", wanted.errors, int)
+    sizes = _numbers("--size", wanted.sizes, float)
+    _check_trials(wanted.trials)
+    if not 0 <= wanted.false_alarms < 1:
+        raise TableError("--false-alarms", None, None, repr(wanted.false_alarms), "a share: 0, or less than 1")
+    if wanted.out is not None:
+        files.check_file(wanted.out, wanted.force)
+    console, warnings = consoles()
+    layout, exact = layout_of(options, warnings)
+    if max(errors) > int(exact.count) - LEAST:
+        expected = (
+            f"at most {int(exact.count) - LEAST} of {int(exact.count)} points, so that {LEAST} good ones are left"
+        )
+        raise TableError("--errors", None, None, str(max(errors)), expected)
+    with progress(warnings, "Comparing", None) as told:
+        found = compare(
+            {layout: exact},
+            procedures,
+            errors=errors,
+            sizes=sizes,
+            trials=wanted.trials,
+            seed=wanted.seed,
+            false_alarms=wanted.false_alarms,
+            progress=told,
+        )
+    if wanted.out is not None:
+        files.write_file(wanted.out, files.csv_text(rows(found)))
+    for part in tables(found):
+        console.print(part, markup=False)
+    if wanted.out is not None:
+        console.print(f"Written to {wanted.out}", markup=False)
+    return True
+
+
+def layout_of(options: Options, warnings: Any) -> tuple[str, Pair]:
+    """The errorless pair that trials are made of, its sigma that of their coordinates, and what to call it."""
+    if options.file is None:
+        return _standard(options)
+    job = jobs.prepared(options)
+    jobs.warn(warnings, job)
+    measured, pair = job.table.pairs[0], job.pairs[0]
+    solved = orient(pair)
+    if not bool(solved.usable):
+        advice = ADVICE[NAMES[int(solved.result._value)]]
+        raise TableError(
+            job.table.file, measured.lines[0], None, f"pair {measured.name!r}: {advice}", "usable elements"
+        )
+    sigma = pair.sigma if job.sigma_known else pair.sigma * solved.sigma0
+    if not float(jnp.max(sigma)) > 0:
+        raise TableError(
+            "--sigma", None, None, "none, and no sigma0 from the pair", "the standard deviation to simulate"
+        )
+    x_left, y_left, x_right, y_right = solved.corrections
+    exact = simulation.planted(pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right)
+    size = f"{float(jnp.mean(sigma)):.3g} {options.unit}"
+    return f"{measured.name}, {len(measured.points)} points, sigma {size}", _with_sigma(exact, sigma)
+
+
+def _standard(options: Options) -> tuple[str, Pair]:
+    """The sixteen points of 1989, f = b = y = 70 mm."""
+    for name, value in (
+        ("--camera", options.camera),
+        ("--focal", options.focal),
+        ("--principal-point", options.principal_point),
+        ("--pixel-size", options.pixel_size),
+        ("--y-down", options.y_down or None),
+    ):
+        if value is not None:
+            raise TableError(name, None, None, "it without FILE.csv", "the table that it belongs to")
+    sigma = SIGMA if options.sigma is None else options.sigma
+    if not (math.isfinite(sigma) and sigma > 0):
+        raise TableError("--sigma", None, None, repr(sigma), "a positive standard deviation")
+    exact = simulation.mock_pair(simulation.row_layout())
+    return f"eight rows, 16 points, f = b = 70 mm, sigma {sigma:g} mm", _with_sigma(exact, exact.sigma * sigma)
+
+
+def _with_sigma(pair: Pair, sigma) -> Pair:
+    return eqx.tree_at(lambda p: p.sigma, pair, sigma)
+
+
+def rows(found: Comparison) -> list[list[Any]]:
+    """The scores as rows of a table; shares of 1, angles in arc minutes, se: standard error."""
+    estimates = ("found", "good_lost", "all_right", "alarms", "unfinished", "angle_arcmin")
+    header: list[Any] = ["layout", "errors", "size_sigma", "procedure", "calibrated", "field", "value", "trials"]
+    table = [header + [name for e in estimates for name in (e, f"{e}_se")]]
+    for s in found.scores:
+        set_to = found.calibrations[s.setting.layout][s.procedure] if s.calibrated else None
+        field, value = (set_to.name, set_to.value) if set_to else ("", None)
+        numbers = [number for e in (s.found, s.lost, s.perfect, s.alarms, s.unfinished, s.angle) for number in e]
+        table.append([*s.setting, s.procedure, s.calibrated, field, value, s.trials, *numbers])
+    return table
+
+
+def _numbers(option: str, text: str, kind: Callable[[str], T]) -> list[T]:
+    """Numbers of a list such as 8,10,15; whole ones from 0, others above 0."""
+    try:
+        values = [kind(part) for part in text.split(",")]
+        good = all(math.isfinite(value) and (value > 0 or (kind is int and value == 0)) for value in values)
+    except ValueError:
+        values, good = [], False
+    if not good:
+        expected = "numbers such as 0,1,2,3" if kind is int else "positive numbers such as 8,10,15"
+        raise TableError(option, None, None, repr(text), expected)
+    return list(dict.fromkeys(values))
+
+
+def _check_trials(trials: int | None) -> None:
+    if trials is not None and trials < 1:
+        raise TableError("--trials", None, None, repr(trials), "1 or more")

@@ -1,0 +1,95 @@
+"""The numbers of a procedure by name, and the same procedure with others."""
+
+import dataclasses
+import math
+import typing
+from typing import Any
+
+import equinox as eqx
+
+from ..rejection import AbstractProcedure
+from .tables import TableError
+
+Number = bool | int | float | None
+
+
+def tolerances(part: Any) -> dict[str, Number]:
+    """Every number of a procedure; those of its parts behind the name of the part: first.eps3, searches.0.limit."""
+    found: dict[str, Number] = {}
+    for name, value in _entries(part).items():
+        if isinstance(value, eqx.Module | tuple):
+            found |= {f"{name}.{below}": number for below, number in tolerances(value).items()}
+        elif _kind(part, name) is not None:
+            found[name] = value
+    return found
+
+
+def changed(procedure: AbstractProcedure, changes: list[str]) -> AbstractProcedure:
+    """The procedure after changes such as eps3=0.05; the part may be left out where only one has such a number.
+
+    Raises TableError for an unknown name or an unusable value.
+    """
+    for change in changes:
+        name, equals, text = (part.strip() for part in change.partition("="))
+        known = tolerances(procedure)
+        named = [path for path in known if path == name] or [path for path in known if path.endswith(f".{name}")]
+        if not equals or len(named) != 1:
+            listed = ", ".join(f"{path}={_shown(value)}" for path, value in known.items()) or "none"
+            found = f"{name!r}" if equals else f"{change!r} without ="
+            if len(named) > 1:
+                found += f", which may be {' or '.join(named)}"
+            raise TableError("--tolerance", None, None, found, f"NAME=VALUE with one of: {listed}")
+        procedure = _with(procedure, named[0], text)
+    return procedure
+
+
+def judges_by_sigma(part: Any) -> bool:
+    """Whether the procedure holds residuals against the standard deviation that the pair states."""
+    entries = _entries(part)
+    if "sigma" in entries:
+        return entries["sigma"] is None and not entries.get("estimated", False)
+    return any(judges_by_sigma(value) for value in entries.values() if isinstance(value, eqx.Module | tuple))
+
+
+def _entries(part: Any) -> dict[str, Any]:
+    """The fields of a module or the entries of a tuple by name."""
+    if isinstance(part, tuple):
+        return {str(place): value for place, value in enumerate(part)}
+    return {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+
+
+def _with(part: Any, path: str, text: str) -> Any:
+    name, _, rest = path.partition(".")
+    value = _entries(part)[name]
+    new = _with(value, rest, text) if rest else _value(name, _kind(part, name), text)
+    if isinstance(part, tuple):
+        return (*part[: int(name)], new, *part[int(name) + 1 :])
+    return dataclasses.replace(part, **{name: new})
+
+
+def _kind(part: Any, name: str) -> type | None:
+    """bool, int or float; None for what is no number."""
+    value = _entries(part)[name]
+    if value is None and not isinstance(part, tuple):
+        allowed = typing.get_args(next(field.type for field in dataclasses.fields(part) if field.name == name))
+        return next((kind for kind in (float, int) if kind in allowed), None)
+    return next((kind for kind in (bool, int, float) if isinstance(value, kind)), None)
+
+
+def _value(name: str, kind: type | None, text: str) -> Number:
+    if kind is bool:
+        if text.lower() in ("true", "false"):
+            return text.lower() == "true"
+        raise TableError("--tolerance", None, None, f"{name}={text}", "true or false")
+    try:
+        value = int(text) if kind is int else float(text)
+    except ValueError:
+        value = -1
+    if value < 0 or not math.isfinite(value):
+        expected = "a whole number, not negative" if kind is int else "a number, not negative"
+        raise TableError("--tolerance", None, None, f"{name}={text}", expected)
+    return value
+
+
+def _shown(value: Number) -> str:
+    return str(value).lower() if isinstance(value, bool) else "none" if value is None else f"{value}"

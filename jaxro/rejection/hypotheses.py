@@ -1,0 +1,162 @@
+"""Random subsets of five points and the orientations they have: what `Ransac` and `LeastMedian` choose from."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from .. import coplanarity
+from ..adjustment import Residuals
+from ..elements import RelativePose
+from ..normal_equations import solve
+from ..pairs import Pair
+from ..programs import stage
+from ..reductions import count
+from ..starts import AbstractStart, Vertical
+from ..starts.decomposition import best_pose
+from ..starts.five_point import five_point
+from ..starts.general import _vectors as vectors
+
+Poses = tuple[RelativePose, Bool[Array, "..."]]
+"""Orientations on a leading axis, and which of them exist."""
+
+
+class AbstractHypotheses(eqx.Module):
+    """A way to orient a pair by five of its points; `block` subsets are solved together."""
+
+    block: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def begin(self, pair: Pair) -> RelativePose | None:
+        """What all subsets of a pair begin with."""
+
+    @abc.abstractmethod
+    def __call__(self, five: Pair, begin: RelativePose | None) -> Poses:
+        """The orientations of five points, on the places of a leading axis of fixed length."""
+
+
+class FivePoint(AbstractHypotheses):
+    """All real solutions of the five-point problem that have the points in front of both photos: any position."""
+
+    block: int = 4
+
+    def begin(self, pair: Pair) -> None:
+        return None
+
+    def __call__(self, five: Pair, begin: None) -> Poses:
+        left, right = vectors(five)
+        essentials, real = five_point(left, right)
+        poses, front = jax.vmap(lambda e: best_pose(e, left, right, five.mask))(essentials)
+        return poses, real & (front == 5)
+
+
+class Newton(AbstractHypotheses):
+    """`steps` of Newton's method on the five conditions, from `start` and in single precision: one orientation.
+
+    A fiftieth of the work of `FivePoint`. From the vertical it reaches near-vertical photos; from `General()` photos in
+    any position, if the wrong points leave that start within some 20° of the solution.
+    """
+
+    start: AbstractStart = Vertical(steps=0)
+    steps: int = 4
+    block: int = 32
+
+    def begin(self, pair: Pair) -> RelativePose:
+        return self.start(pair).pose  # pyright: ignore[reportReturnType]
+
+    def __call__(self, five: Pair, begin: RelativePose) -> Poses:
+        single = lambda a: a.astype(jnp.float32)
+        left, right = single(five.focal_left), single(five.focal_right)
+        points = [tuple(single(c[i]) for c in five.coordinates) for i in range(5)]
+        zero, one = jnp.zeros_like(left), jnp.ones_like(left)
+
+        def linearised(pose: RelativePose):
+            """F and its derivatives by the five parameters."""
+            slopes = []
+            for k in range(5):
+                at = lambda x, k=k: pose.moved((zero,) * k + (x,) + (zero,) * (4 - k))
+                f, slope = jax.jvp(lambda x, at=at: coplanarity.fundamental_matrix(at(x), left, right), (zero,), (one,))
+                slopes.append(slope)
+            return [*slopes, f]
+
+        def rows(matrices):
+            """g is linear in F, so that its derivatives are g of those of F."""
+            return [[coplanarity.condition(f, point) for f in matrices] for point in points]
+
+        def normal(rows):
+            return [[sum(row[i] * row[j] for row in rows) for j in range(i + 1)] for i in range(6)]
+
+        def step(_, pose: RelativePose):
+            *n, (*h, _) = stage(normal)(stage(rows)(stage(linearised)(pose)))
+            return pose.moved(tuple(-d for d in solve(n, h)))
+
+        pose = lax.fori_loop(0, self.steps, step, jax.tree.map(single, begin))
+        fine = jnp.isfinite(sum(jax.tree.leaves(pose)))
+        pose = jax.tree.map(lambda a: jnp.where(fine, a, one).astype(five.focal_left.dtype), pose).normalised()
+        return jax.tree.map(lambda a: a[None], pose), fine[None]
+
+
+def draws(seed: int, blocks: int, block: int) -> Float[Array, "block 5 subset"]:
+    """Uniform random numbers, the same for every pair."""
+    return jnp.asarray(np.random.default_rng(seed).random((blocks, 5, block)))
+
+
+def subsets(uniform: Float[Array, "5 subset"], size: Float[Array, ""]) -> Int[Array, "5 subset"]:
+    """Five different numbers below `size` in ascending order, every choice equally likely."""
+    taken: list = []
+    for j in range(5):
+        rest = jnp.maximum(size - j, 1.0)
+        larger = jnp.minimum(jnp.floor(uniform[j] * rest), rest - 1)
+        for other in taken:  # the number counts those that are left
+            larger = larger + jnp.where(larger >= other, 1.0, 0.0)
+        ascending = []
+        for other in taken:
+            ascending.append(jnp.minimum(other, larger))
+            larger = jnp.maximum(other, larger)
+        taken = [*ascending, larger]
+    return jnp.stack(taken).astype(jnp.int32)
+
+
+def moved_up(pair: Pair) -> Float[Array, "point 4"]:
+    """The coordinates of the points that take part, moved before all others, so that padding changes no subset."""
+    rows = jnp.stack(pair.coordinates, axis=-1)
+    place = jnp.where(pair.mask, jnp.cumsum(pair.mask) - 1, len(rows))
+    return jnp.zeros_like(rows).at[place].set(rows, mode="drop")
+
+
+def chosen(pair: Pair, points: Float[Array, "point 4"], places: Int[Array, "5 subset"]) -> Pair:
+    """The subsets as pairs of five points, of unit weight."""
+    five = points.at[places.T].get(mode="clip")
+    focal = lambda f: jnp.broadcast_to(f, five.shape[:1])
+    return Pair(
+        *(five[:, :, k] for k in range(4)),
+        jnp.ones_like(five[:, :, 0]),
+        jnp.ones(five.shape[:2], bool),
+        focal(pair.focal_left),
+        focal(pair.focal_right),
+    )
+
+
+def solutions(hypotheses: AbstractHypotheses, pair: Pair, points, begin, uniform) -> Poses:
+    """The orientations of a block of subsets, one after another on the leading axis."""
+    five = chosen(pair, points, subsets(uniform, count(pair.mask)))
+    found = jax.vmap(lambda five: hypotheses(five, begin))(five)
+    return jax.tree.map(lambda a: a.reshape(-1), found)
+
+
+def squares(pair: Pair, pose: RelativePose) -> Float[Array, "point"]:
+    """(r / sigma)² of every point."""
+    prepare, condition, observations, cofactor = coplanarity.rigorous(pair)
+    residuals = Residuals(prepare, condition, pose, observations, cofactor, pair.mask)
+    one = lambda g, d, use: jnp.where(use, g[0] ** 2 / d[0][0], 0.0)
+    return residuals.groups(one, residuals.shared(*(jnp.zeros_like(pair.focal_left),) * 5))
+
+
+def best(poses: RelativePose, score: Float[Array, "hypothesis"]) -> RelativePose:
+    """The pose with the lowest score."""
+    first = jnp.argmin(score)
+    return jax.tree.map(lambda a: a[first], poses)

@@ -1,0 +1,113 @@
+"""The procedure to begin with, made of what the comparisons prove best."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.special import gammaln
+from jaxtyping import Array, Float
+
+from .. import critical_values
+from ..elements import RelativePose
+from ..pairs import Pair, cleaned
+from ..reductions import count, total
+from .base import OUTCOMES, AbstractProcedure, Rejection
+from .graduated_non_convexity import GraduatedNonConvexity
+from .hypotheses import FivePoint, Newton
+from .ransac import Ransac
+from .robust import AbstractSearch, agreeing, at, in_front, judged, one_by_one, scaled
+
+class Recommended(AbstractProcedure):
+    """Searches, each only where the one before found nothing convincing, then normalised residuals.
+
+    1. Graduated non-convexity from the vertical: no subsets, its work grows with n; right in nearly all near-vertical
+       pairs of fifty and more points with half of them wrong.
+    2. Random subsets of five points solved by Newton's method from the vertical: for few points, where 1 fails.
+    3. Thirty times as many of them: for few points, half of them wrong.
+    4. Random subsets solved by the five-point method: for photos in any position.
+
+    What is found is solved by least squares, and every point, in use or not, judged anew by its normalised residual
+    |w| at the familywise `level`, in turns: a good point that a search lost comes back. The same is done point by point
+    from all points, by which few and small errors are found best; that set is taken if it convinces, or if its
+    Σ r² + limit² (rejected) is the smaller.
+
+    How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) of such sets that agree by
+    accident, p = limit / mean |r| of the rejected points being about the share of wrong points that agree by chance.
+    Above `accidents` of a search the next one follows; above the last of them the outcome is `no_consensus`.
+    """
+
+    sigma: float | None = None
+    level: float = 0.001
+    rounds: int = 10
+    searches: tuple[AbstractSearch, ...] = (
+        GraduatedNonConvexity(),
+        Ransac(hypotheses=Newton(), count=32, limit=5.0),
+        Ransac(hypotheses=Newton(), count=1024, limit=5.0),
+        Ransac(hypotheses=FivePoint(), limit=5.0),
+    )
+    accidents: tuple[float, ...] = (1e-6, 1e-6, 0.05, 0.05)
+
+    def __call__(self, pair: Pair) -> Rejection:
+        pair = scaled(cleaned(pair)[0], self.sigma)
+        fixed = lax.stop_gradient(pair)
+        limit = critical_values.by_count(
+            lambda n: critical_values.normal(self.level / jnp.maximum(n, 1.0)), pair.x_left.shape[0], count(pair.mask)
+        )
+        pose, use = self._found(self.searches[0], fixed, limit)
+        expected = self._accidents(fixed, pose, use, limit)
+        for search, most in zip(self.searches[1:], self.accidents, strict=False):
+            pose, use, expected = self._elsewhere(search, fixed, limit, pose, use, expected, ~(expected <= math.log(most)))
+        convinced = expected <= math.log(self.accidents[-1])
+        verdict = judged(pair, pose, use, limit)
+        return Rejection(
+            verdict.mask,
+            verdict.order,
+            verdict.statistic,
+            verdict.log,
+            verdict.orientation,
+            OUTCOMES.where(convinced, verdict.outcome, OUTCOMES.no_consensus),
+        )
+
+    def stages(self) -> list["Recommended"]:
+        """The searches as procedures of their own, for batches: each for the pairs that the one before left open."""
+        return [
+            dataclasses.replace(self, searches=(search,), accidents=(most,))
+            for search, most in zip(self.searches, self.accidents, strict=True)
+        ]
+
+    def _found(self, search: AbstractSearch, pair: Pair, limit: Float[Array, ""]):
+        pose = search.search(pair)
+        pose = pose if isinstance(pose, RelativePose) else pose[0]
+        use = pair.mask & (at(pair, pose).squares <= limit**2)
+        found = agreeing(pair, pose, use, limit, self.rounds)
+        best, lowest = one_by_one(pair, *found, limit, 2)
+        # small errors do not stand out in a search: the points one by one, beginning with all of them
+        other, cost = one_by_one(pair, pose, pair.mask, limit, self.rounds)
+        first = (cost < lowest) | (self._accidents(pair, *other, limit) <= math.log(self.accidents[0]))
+        return jax.tree.map(lambda a, b: jnp.where(first, a, b), other, best)
+
+    def _elsewhere(self, search, pair: Pair, limit, pose: RelativePose, use, expected, needed):
+        """The same by another search where it is needed: a loop of at most one round, which under vmap is entered only
+        if some pair of the batch needs it. What it works on depends on the round, or XLA would compute it anyway."""
+
+        def again(state):
+            needed, *found = state
+            masked = cleaned(pair.with_mask(pair.mask & needed))[0]
+            pose, use = self._found(search, masked, limit)
+            new = [pose, use, self._accidents(pair, pose, use, limit)]
+            return needed & False, *jax.tree.map(lambda a, b: jnp.where(needed, a, b), new, found)
+
+        return lax.while_loop(lambda state: state[0], again, (needed, pose, use, expected))[1:]
+
+    def _accidents(self, pair: Pair, pose: RelativePose, use, limit) -> Float[Array, ""]:
+        """Logarithm of the expected number."""
+        linear, mask = at(pair, pose), pair.mask
+        use = use & (linear.squares <= limit**2) & in_front(pair, pose)
+        n, k = count(mask), count(use)
+        wrong = mask & ~use
+        mean = total(jnp.where(wrong, jnp.sqrt(linear.squares), 0.0)) / jnp.maximum(count(wrong), 1.0)
+        chance = limit / jnp.maximum(mean, 2 * limit)
+        choices = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
+        return jnp.where(k > 5, choices + (k - 5) * jnp.log(chance), jnp.inf)
