@@ -14,8 +14,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 Scalar = Float[Array, "..."]
 
-BISECTIONS = 60
-"""Halvings of an interval: to the last bit of a double."""
+BISECTIONS = 120
+"""Halvings of an interval: to the last bit of a double even near zero."""
 
 
 def normal(level: ArrayLike) -> Scalar:
@@ -58,12 +58,12 @@ def grubbs(level: ArrayLike, count: ArrayLike) -> Scalar:
     return jnp.where(n > 2, g * jnp.sqrt(n / (n - 1)), jnp.inf)
 
 
-def by_count(value: Callable[[Array], Scalar], most: int, count: Float[Array, "..."]) -> Scalar:
+def by_count(value: Callable[[Array], Scalar], most: int, count: Float[Array, ""]) -> Float[Array, ""]:
     """value(count) for a count of 0 to `most` that is known only at run time: looked up, not calculated again."""
     with jax.ensure_compile_time_eval():
         table = value(jnp.arange(most + 1.0))
-    here = jnp.arange(most + 1) == count.astype(int)[..., None]
-    return jnp.sum(jnp.where(here, table, 0.0), axis=-1)
+    here = jnp.arange(most + 1) == count.astype(int)
+    return jnp.sum(jnp.where(here, table, 0.0))
 
 
 def _where(above: Callable[[Array], Array], most: Array, increasing: bool) -> Scalar:

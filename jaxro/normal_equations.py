@@ -79,9 +79,9 @@ def cholesky(n: Lower) -> tuple[Lower, Scalar]:
     return factor, smallest
 
 
-def substitute(factor: Lower, h: Scalars) -> list[Scalar]:
-    """N⁻¹ h by forward and back substitution."""
-    x: list[Scalar] = []
+def substitute(factor: Lower, h: Scalars) -> list[Any]:
+    """N⁻¹ h by forward and back substitution; of many right-hand sides at once where the entries of h are arrays."""
+    x: list[Any] = []
     for i, row in enumerate(factor):
         s = h[i]
         for k in range(i):

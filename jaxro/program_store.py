@@ -12,11 +12,11 @@ import platform
 import tempfile
 from collections.abc import Callable
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
-import jaxlib
 from jaxtyping import PyTree
 
 MOST = 40
@@ -55,18 +55,18 @@ def compiled(function: Callable, settings: dict[str, Any] | None, data: PyTree, 
     path = (_folder or Path()) / f"{hashlib.sha256(content).hexdigest()}.program"
     stored = _read(path)
     if stored is None:
-        shape = None
+        shapes_out: list[Any] = []
 
         def flat(*leaves):
-            nonlocal shape
             out, shape = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
+            shapes_out.append(shape)
             return out
 
         from jax.experimental import serialize_executable
 
         program = jax.jit(flat, compiler_options=settings).lower(*leaves).compile()
         # the structure itself cannot be pickled, but an object of that structure can
-        like = jax.tree.unflatten(shape, [0] * shape.num_leaves)
+        like = jax.tree.unflatten(shapes_out[0], [0] * shapes_out[0].num_leaves)
         _write(path, pickle.dumps((*serialize_executable.serialize(program), like)))
     else:
         program, like = stored
@@ -114,6 +114,6 @@ def _surroundings() -> tuple:
         processor = next(line for line in lines if line.startswith(("flags", "Features")))
     except (OSError, StopIteration):
         processor = platform.processor()
-    versions = (jax.__version__, jaxlib.__version__, platform.python_version())
-    flags = (os.environ.get("XLA_FLAGS"), jax.config.jax_enable_x64, os.cpu_count())
+    versions = (jax.__version__, version("jaxlib"), platform.python_version())
+    flags = (os.environ.get("XLA_FLAGS"), jax.dtypes.canonicalize_dtype(float).name, os.cpu_count())
     return source.hexdigest(), platform.machine(), processor, versions, flags

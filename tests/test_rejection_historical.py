@@ -3,7 +3,7 @@
 A procedure is compiled once, for batches of `BATCH` pairs of `PLACES` points; every test uses that program.
 """
 
-from functools import partial
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -75,6 +75,7 @@ def random_pair(key, layout):
     return pair(*(jnp.where(mask, c, jnp.nan) for c in measured.coordinates), focal=70.0, mask=mask)
 
 
+@lru_cache
 def random_pairs(count, *layouts):
     """`count` pairs, as many of each layout."""
     keys = jax.random.split(jax.random.key(0), (len(layouts), count // len(layouts)))

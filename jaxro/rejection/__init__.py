@@ -4,8 +4,8 @@ Each is an object with its tolerances as fields: `procedure(pair) -> Rejection`,
 is the one list of them.
 """
 
-from .base import OUTCOMES as OUTCOMES, AbstractProcedure as AbstractProcedure, Log as Log, Rejection as Rejection
 from .all_subsets import AllSubsets as AllSubsets
+from .base import OUTCOMES as OUTCOMES, AbstractProcedure as AbstractProcedure, Log as Log, Rejection as Rejection
 from .data_snooping import DataSnooping as DataSnooping
 from .dorozhinsky import Dorozhinsky as Dorozhinsky
 from .graduated_non_convexity import GraduatedNonConvexity as GraduatedNonConvexity

@@ -94,8 +94,7 @@ class AllSubsets(AbstractProcedure):
 
 
 def _choices(n: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Omissions (choice, point) of 0 to `most` points and how many each has; filled up with repeats of none, of size -1,
-    to whole blocks."""
+    """Omissions (choice, point) of 0 to `most` points and how many each has; whole blocks, the rest of size -1."""
     rows = [c for k in range(most + 1) for c in combinations(range(n), k)]
     count = -(-len(rows) // BLOCK) * BLOCK
     omitted, sizes = np.zeros((count, n), bool), np.full(count, -1)

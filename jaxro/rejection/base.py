@@ -32,8 +32,8 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     nothing_to_test = "The procedure does not apply: too few points to reject any."
     no_consensus = (
-        "No orientation was found that so many points agree with that it cannot be an accident. Measure more points, or "
-        "give the standard deviation of the coordinates."
+        "No orientation was found that so many points agree with that it cannot be an accident. Measure more points, "
+        "or give the standard deviation of the coordinates."
     )
     not_oriented = "The points that were kept do not orient the pair; see the result of its orientation."
 
@@ -103,7 +103,7 @@ class History(NamedTuple):
 def began(pair: Pair, rounds: int) -> History:
     """No round yet, with room for `rounds` in the log."""
     n = pair.x_left.shape[0]
-    zero = pair.x_left[:1] * 0
+    zero = pair.focal_left * 0
     wide = jnp.zeros((rounds, n)) + zero
     log = Log(wide[:, 0] > 1, wide, wide[:, 0], wide > 1, wide, jnp.zeros((rounds, 5)) + zero)
     none = jnp.zeros_like(pair.mask, int)
@@ -163,7 +163,9 @@ def largest(values: PointValues, use: Bool[Array, "point"]) -> Bool[Array, "poin
 def ranks(values: PointValues, use: Bool[Array, "point"]) -> Int[Array, "point"]:
     """How many of the points in use have a larger value (or an equal one and stand before)."""
     index = jnp.arange(values.shape[0])
-    before = (values[None, :] > values[:, None]) | ((values[None, :] == values[:, None]) & (index < index[:, None]))
+    before = (values[None, :] > values[:, None]) | (
+        (values[None, :] == values[:, None]) & (index[None, :] < index[:, None])
+    )
     return jnp.sum(jnp.where(before & use[None, :], 1, 0), axis=1)
 
 
@@ -188,8 +190,9 @@ def by_parallax(
     pair: Pair, mask: Bool[Array, "point"], start: AbstractElements | None = None, max_steps: int = 30
 ) -> Orientation:
     """The strict orientation of the papers: q of unit weight, independent elements, from zero if no start is given."""
+    unit = Pair(*pair.coordinates, jnp.ones_like(pair.sigma), pair.mask, pair.focal_left, pair.focal_right)
     return orient(
-        pair.with_mask(mask),
+        unit.with_mask(mask),
         elements=IndependentElements,
         residual=coplanarity.parallax,
         start=zero_elements(pair) if start is None else start,

@@ -32,8 +32,12 @@ from .base import (
     values,
 )
 
-UNTESTABLE = 1e-6
-"""Redundancy number below which the omission of a point leaves a singular system."""
+UNTESTABLE = 1e-3
+"""Redundancy number below which the omission of a point leaves a (nearly) singular system: the refits then do not
+converge in two iterations, and one such row would hide all others."""
+
+ROUNDING = 1e-10
+"""Differences of means (of the unit of the coordinates, or relative to them) that say nothing."""
 
 Means = tuple[Float[Array, "point"], Bool[Array, "point"]]
 
@@ -94,7 +98,9 @@ def grubbs_statistic(means: Float[Array, "point"], use: Bool[Array, "point"]) ->
     """V of every omission: (mean of the means - its mean) / S, eqs (7) to (9)."""
     centre = mean_of(means, use)
     spread = jnp.sqrt(mean_of((means - centre) ** 2, use))
-    return jnp.where(use & (spread > 0), (centre - means) / jnp.where(spread > 0, spread, 1.0), 0.0)
+    # pairs without any error differ by rounding alone
+    real = spread > ROUNDING * jnp.maximum(centre, 1.0)
+    return jnp.where(use & real, (centre - means) / jnp.where(real, spread, 1.0), 0.0)
 
 
 class LeaveOneOutGrubbs(AbstractProcedure):

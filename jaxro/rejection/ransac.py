@@ -71,7 +71,7 @@ class Ransac(AbstractSearch):
         table = draws(self.seed, -(-self.count // block), block)
 
         def more(old: Found):
-            return (old.blocks < table.shape[0]) & (old.blocks * block < old.enough)
+            return (old.blocks < table.shape[0]) & (old.blocks.astype(old.enough.dtype) * block < old.enough)
 
         def searched(old: Found):
             poses, exist = solutions(self.hypotheses, pair, points, begin, table[old.blocks])

@@ -19,6 +19,7 @@ from .hypotheses import FivePoint, Newton
 from .ransac import Ransac
 from .robust import AbstractSearch, agreeing, at, in_front, judged, one_by_one, scaled
 
+
 class Recommended(AbstractProcedure):
     """Searches, each only where the one before found nothing convincing, then normalised residuals.
 
@@ -58,7 +59,9 @@ class Recommended(AbstractProcedure):
         pose, use = self._found(self.searches[0], fixed, limit)
         expected = self._accidents(fixed, pose, use, limit)
         for search, most in zip(self.searches[1:], self.accidents, strict=False):
-            pose, use, expected = self._elsewhere(search, fixed, limit, pose, use, expected, ~(expected <= math.log(most)))
+            pose, use, expected = self._elsewhere(
+                search, fixed, limit, pose, use, expected, ~(expected <= math.log(most))
+            )
         convinced = expected <= math.log(self.accidents[-1])
         verdict = judged(pair, pose, use, limit)
         return Rejection(
@@ -79,7 +82,6 @@ class Recommended(AbstractProcedure):
 
     def _found(self, search: AbstractSearch, pair: Pair, limit: Float[Array, ""]):
         pose = search.search(pair)
-        pose = pose if isinstance(pose, RelativePose) else pose[0]
         use = pair.mask & (at(pair, pose).squares <= limit**2)
         found = agreeing(pair, pose, use, limit, self.rounds)
         best, lowest = one_by_one(pair, *found, limit, 2)

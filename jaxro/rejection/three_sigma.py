@@ -34,7 +34,7 @@ class ThreeSigma(AbstractProcedure):
         q = jnp.abs(first.parallax)
         limit = self.factor * first.m_q
         enough = pair.count > self.more_than
-        bad = pair.mask & (q >= limit) & (q > 0) & enough
+        bad = pair.mask & (q >= limit) & (q > 1e-12 * pair.focal_left) & enough
         bad = at_most(bad, q, pair.mask, self.least)
         history = recorded(began(pair, 1), Round(q, limit, bad, first.parallax, values(first.elements)))
         outcome = OUTCOMES.where(enough, finished(pair), OUTCOMES.nothing_to_test)

@@ -1,0 +1,93 @@
+"""The modern procedures on known errors: the geometry of 1971, small errors, many gross errors."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import problems
+import pytest
+
+import jaxro
+from benchmarks.workload import FOCAL, aerial
+from jaxro import simulation
+from jaxro.rejection import OUTCOMES, AllSubsets, DataSnooping, GraduatedNonConvexity, Recommended
+
+RECOMMENDED = Recommended(sigma=0.01)
+NEAR = dataclasses.replace(
+    RECOMMENDED, searches=RECOMMENDED.searches[:3], accidents=RECOMMENDED.accidents[:3], level=0.01
+)
+"""Without the search for photos in any position, which takes long to compile."""
+
+
+def verdict(rejection):
+    return rejection.mask, rejection.outcome == OUTCOMES.no_consensus
+
+
+def kept(pairs, procedure):
+    mask, lost = jaxro.clean_batch(pairs, procedure, select=verdict)
+    return np.asarray(mask), np.asarray(lost)
+
+
+@pytest.mark.parametrize("points", [8, pytest.param(10, marks=pytest.mark.slow)])
+def test_wrong_points_of_1971_that_its_own_procedure_keeps(points):
+    """Points 7 to `points`, exactly, where Dorozhinsky's algorithm rejects others."""
+    pair = problems.table_1(points)
+    for procedure in (AllSubsets(sigma=0.01, most=points - 6), GraduatedNonConvexity(sigma=0.01)):
+        mask = jax.jit(lambda pair, procedure=procedure: procedure(pair).mask)(pair)
+        assert list(np.flatnonzero(~np.asarray(mask)) + 1) == list(range(7, points + 1))
+
+
+def layout_of_1989(count: int, seed: int):
+    """Clean pairs of the 16-point layout, sigma .01 mm, and the same with one to three errors of 8 to 15 sigma."""
+    rng = np.random.default_rng(seed)
+    exact = np.stack(simulation.mock_pair(simulation.row_layout()).coordinates)
+    measured = exact[:, None] + rng.normal(0, 0.01, (4, count, 16))
+    wrong = np.argsort(rng.random((count, 16)), 1) < rng.integers(1, 4, (count, 1))
+    size = 0.01 * rng.uniform(8, 15, wrong.shape) * rng.choice([-1, 1], wrong.shape)
+    return measured, measured + wrong * size * np.array([0, 0, 0, 1])[:, None, None], wrong
+
+
+@pytest.mark.slow
+def test_small_errors_as_by_data_snooping_or_better_and_the_table_of_1971():
+    """At the same rate of false alarms at least as many pairs are cleaned perfectly; six wrong points of 16 go."""
+    count = 2047
+    clean, measured, wrong = layout_of_1989(count, seed=21)
+    six = np.stack(problems.table_1(16).coordinates)[:, None]
+    with_table = jaxro.pair(*np.concatenate([measured, six], axis=1), focal=70.0)
+    clean = jaxro.pair(*np.concatenate([clean, clean[:, :1]], axis=1), focal=70.0)
+    shares = {}
+    for name, procedure in (
+        ("recommended", NEAR),
+        ("snooping", DataSnooping(sigma=0.01, level=0.01, familywise=True)),
+    ):
+        alarms = (~kept(clean, procedure)[0]).any(axis=1)
+        mask, lost = kept(with_table, procedure)
+        shares[name] = alarms.mean(), (mask[:count] == ~wrong).all(axis=1).mean()
+        if name == "recommended":
+            assert list(np.flatnonzero(~mask[count]) + 1) == [7, 8, 9, 10, 15, 16] and not lost[count]
+            assert lost[:count].mean() < 0.001
+    noise = 2 * np.sqrt(0.01 / count)
+    assert abs(shares["recommended"][0] - shares["snooping"][0]) < noise and shares["recommended"][0] < 0.01 + noise
+    assert shares["recommended"][1] >= shares["snooping"][1] > 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [64, 1000])
+@pytest.mark.parametrize(("share", "least"), [(0.2, 0.99), (0.5, 0.95)])
+def test_a_fifth_and_half_of_250_points_wrong(count, share, least):
+    """The planted set exactly: sigma .5 µm, errors of 12 to 290 µm in the right-hand y."""
+    rng = np.random.default_rng(3)
+    measured = np.stack(aerial(count, 250, sigma=0.0005, seed=5))
+    wrong = np.argsort(rng.random((count, 250)), 1) < round(share * 250)
+    measured[3] += wrong * rng.choice([-1, 1], wrong.shape) * rng.uniform(0.012, 0.290, wrong.shape)
+    mask, lost = kept(jaxro.pair(*measured, focal=FOCAL), dataclasses.replace(NEAR, sigma=0.0005, level=0.001))
+    exact = (mask == ~wrong).all(axis=1)
+    assert exact.mean() >= min(least, 1 - 1.5 / count) and not lost.any()
+
+
+@pytest.mark.slow
+def test_a_pair_of_mismatches_alone_is_told():
+    """Coordinates that belong to no common points: no consensus, never an orientation that looks good."""
+    rng = np.random.default_rng(8)
+    pairs = jaxro.pair(*rng.uniform(-70, 70, (4, 2048, 16)), focal=FOCAL)
+    assert kept(pairs, NEAR)[1].mean() > 0.9
