@@ -4,6 +4,7 @@ import csv
 import json
 import math
 
+import jax
 import numpy as np
 import pytest
 from test_tables import write
@@ -12,8 +13,7 @@ from typer.testing import CliRunner
 import jaxro
 from jaxro import simulation
 from jaxro.cli import app
-from jaxro.io import cleaning, mock_example, tables, tolerances, verdicts
-from jaxro.programs import QUICK, Program
+from jaxro.io import mock_example, tables, tolerances, verdicts
 from jaxro.rejection import OUTCOMES, PROCEDURES, Dorozhinsky, TwoStage
 
 FILES = {
@@ -87,7 +87,8 @@ def test_the_log_is_that_of_python_to_the_last_digit(cleaned, sample):
     _, out = cleaned
     (measured,) = tables.read(sample).pairs
     pair = jaxro.pair(*measured.coordinates, focal=mock_example.FOCAL, sigma=measured.sigma)
-    _, found = Program(cleaning._decided, {"procedure": Dorozhinsky(), "select": verdicts.with_log}, QUICK)(pair)
+    _, batch = jaxro.clean_batch(jaxro.stack([pair]), Dorozhinsky(), select=verdicts.with_log)
+    found = jax.tree.map(lambda a: a[0], batch)
     happened = np.asarray(found.happened)
     log = rows(out / "decisions.csv")
     numbers = [int(row["round"]) for row in log]

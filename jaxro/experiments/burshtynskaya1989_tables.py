@@ -31,29 +31,29 @@ def tables(results: Results) -> "list[str | Table]":
         f"Table 2: {pairs} mock pairs, without noise as in the paper and with noise; eps4 [mm]: tolerance of the first "
         "stage",
         _table_2(results),
-        "By class of errors: I 1 sigma, II 10-15 sigma, III 8-10 sigma; sigma 0.01 mm",
+        "By class of errors: I 1 sigma, II 10-15 sigma, III 8-10 sigma; lost: good points",
         _by_class(results),
-        "Pairs that the text describes, without noise: points rejected by residual parallax, then by Grubbs",
+        "Pairs that the text describes: points rejected by residual parallax; by Grubbs",
         _named(results),
     ]
 
 
 def _title(run: Run) -> str:
-    return f"{run.eps4:g} mm, {'noise' if run.noise else 'no noise'}"
+    return f"{run.eps4:g}{', noise' * run.noise}"
 
 
 def _table_2(results: Results) -> "Table":
-    heads = ["with noise" if run.noise else f"eps4 {run.eps4:g}" for run in results.runs]
+    heads = ["noise" if run.noise else f"eps4 {run.eps4:g}" for run in results.runs]
     rows = table("", *heads, "paper")
     columns = [astuple(run.total) for run in results.runs] + [astuple(PAPER)]
     for place, (name, whole) in enumerate(ROWS):
-        cells = [f"{c[place]}{_share(c[place], c[whole]) if whole else ' ' * 6}" for c in columns]
+        cells = [f"{c[place]}{_share(c[place], c[whole]) if whole else ' ' * 5}" for c in columns]
         rows.add_row(name, *cells, end_section=place == 5)
     return rows
 
 
 def _by_class(results: Results) -> "Table":
-    rows = table("eps4", "class", "errors", "parallax", "Grubbs", "missed", "good lost", "pairs", "cleaned", left=2)
+    rows = table("eps4", "class", "errors", "parallax", "Grubbs", "missed", "lost", "pairs", "cleaned", left=2)
     for run in results.runs:
         for name, c in run.by_class.items():
             cleaned = c.pairs_by_parallax + c.pairs_by_grubbs
@@ -63,14 +63,14 @@ def _by_class(results: Results) -> "Table":
 
 
 def _named(results: Results) -> "Table":
-    rows = table("variant", "errors [mm]", "paper", *(f"eps4 {eps4:g} mm" for eps4 in results.named), left=5)
-    listed = lambda points: ", ".join(map(str, points)) or "-"
+    rows = table("variant", "errors [mm]", "paper", *(f"eps4 {eps4:g}" for eps4 in results.named), left=5)
+    listed = lambda points: " ".join(map(str, points)) or "-"
     for name, variant in NAMED.items():
-        errors = ", ".join(f"{error:+g} at {point}" for point, error in variant.errors.items())
-        found = ["; then ".join(map(listed, of[name])) for of in results.named.values()]
+        errors = ", ".join(f"{point} {error:+g}" for point, error in variant.errors.items())
+        found = ["; ".join(map(listed, of[name])) for of in results.named.values()]
         rows.add_row(name, errors, listed(variant.rejected), *found)
     return rows
 
 
 def _share(part: int, whole: int) -> str:
-    return f" {100 * part / whole:3.0f} %" if whole else ""
+    return f" {100 * part / whole:3.0f}%" if whole else ""

@@ -34,14 +34,14 @@ def _both(scores: list[Score]) -> "Iterator[Table]":
 
 
 def _clean(scores: list[Score]) -> "Table":
-    rows = table("no errors", "false alarms", "good lost", "unfinished", "angle [']")
+    rows = table("no errors", "false alarms", "good lost", "undone", "angle [']")
     for s in scores:
         rows.add_row(s.procedure, *map(_percent, (s.alarms, s.lost, s.unfinished)), _angle(s))
     return rows
 
 
 def _spoiled(scores: list[Score]) -> "Table":
-    rows = table("errors", "procedure", "found", "good lost", "all right", "unfinished", "angle [']", left=2)
+    rows = table("errors", "procedure", "found", "good lost", "all right", "undone", "angle [']", left=2)
     for setting, members in groupby(scores, key=lambda s: s.setting):
         rows.add_section()
         title = f"{setting.errors} x {setting.size:g}σ"

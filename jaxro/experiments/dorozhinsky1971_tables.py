@@ -16,12 +16,11 @@ if TYPE_CHECKING:
 def tables(results: Results) -> "list[str | Table]":
     """What `jaxro reproduce` prints."""
     return [
-        "Table 1: residual parallaxes of the strict solution, hundredths of mm; printed, and the difference",
-        _table_1(results, (7, 8, 9)),
-        _table_1(results, (10, 16)),
-        f"n = 6, no errors: no residual is above {np.max(np.abs(results.columns[0].parallax)):.0e} mm. "
+        "Table 1: residual parallaxes of the strict solution, hundredths of mm; the paper's, difference",
+        *(_table_1(results, counts) for counts in ((7, 8), (9, 10), (16,))),
+        f"n = 6, no errors: largest residual {np.max(np.abs(results.columns[0].parallax)):.2g} mm. "
         "The sign at point 5, n = 9, is a misprint.",
-        "Table 2: residual parallaxes by iteration, hundredths of mm (iteration 1: at zero elements)",
+        "Table 2: residual parallaxes by iteration, hundredths of mm (1: at zero elements)",
         _by_iteration(results.parallax * 100, TABLE_2, [str(i) for i in range(1, 9)]),
         "Table 2: elements by iteration, arc minutes",
         _by_iteration(results.elements, TABLE_2_ELEMENTS, ["alpha", "chi", "alpha'", "omega'", "chi'"]),
@@ -30,7 +29,7 @@ def tables(results: Results) -> "list[str | Table]":
         "The printed forms come from an averaged solution, not from least squares.",
         f"Nine residuals of 0.01 mm and one of 0.10 mm: m_q = {results.m_q:.4f} mm (paper 0.045), "
         f"3 m_q = {3 * results.m_q:.2f} mm (paper 0.13): nothing is rejected",
-        "The proposed algorithm on the pairs of table 1: rejected in this order, and what it leaves",
+        "The proposed algorithm on the pairs of table 1: rejected in this order, mean |q| left",
         _algorithm(results),
         "Where a wrong point is kept the mean is below its tolerance of 0.1 mm, so that the algorithm reports success.",
     ]
@@ -76,8 +75,8 @@ def _equation(results: Results, equation: int) -> "Table":
 
 
 def _algorithm(results: Results) -> "Table":
-    rows = table("n", "wrong points", "rejected", "wrong kept", "good lost", "mean |q| left", "outcome", left=5)
+    rows = table("n", "wrong points", "rejected", "missed", "good lost", "mean |q|", "outcome", left=5)
     for c in results.columns:
-        cells = [", ".join(map(str, numbers)) or "-" for numbers in (c.wrong, c.rejected, c.missed, c.lost)]
+        cells = [" ".join(map(str, numbers)) or "-" for numbers in (c.wrong, c.rejected, c.missed, c.lost)]
         rows.add_row(str(c.points), *cells, f"{number(c.left, 3)} mm", c.outcome)
     return rows

@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 def table(*heads: str, left: int = 1) -> Table:
     """An empty table; its first `left` columns are text, the others numbers."""
     from rich import box
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
     empty = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for place, head in enumerate(heads):
-        empty.add_column(escape(head), justify="left" if place < left else "right", no_wrap=True)
+        empty.add_column(Text(head), justify="left" if place < left else "right", no_wrap=True)
     return empty
 
 

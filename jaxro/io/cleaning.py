@@ -11,9 +11,9 @@ from .. import coplanarity
 from ..batch import clean_batch, orient_batch
 from ..elements import AbstractElements
 from ..orientation import Orientation, orient
-from ..pairs import Pair
+from ..pairs import Pair, stack
 from ..programs import QUICK, Program
-from ..rejection import PROCEDURES, AbstractProcedure, Rejection
+from ..rejection import PROCEDURES, AbstractProcedure
 from . import files, job as jobs, mock_example, verdict_report, verdicts as judged
 from .buckets import each
 from .console import consoles, progress
@@ -76,7 +76,7 @@ def clean_all(
     select = judged.without_log if job.options.out is None else judged.with_log
 
     def one(pair: Pair):
-        found, log = Program(_decided, {"procedure": procedure, "select": select}, QUICK)(pair)
+        found, log = jax.tree.map(lambda a: a[0], clean_batch(stack([pair]), procedure, select=select))
         oriented = orient(pair.with_mask(found.kept), **job.keywords)
         return found, log, oriented, Program(_parallaxes, {}, QUICK)((pair, oriented.pose))
 
@@ -93,10 +93,6 @@ def clean_all(
         oriented[i] = _of_points(orientation, np.flatnonzero(found.kept))
     every = range(len(job.pairs))
     return [verdicts[i] for i in every], [oriented[i] for i in every]
-
-
-def _decided(pair: Pair, *, procedure: AbstractProcedure, select: Callable[[Rejection], tuple]) -> tuple:
-    return select(procedure(pair))
 
 
 def _parallaxes(pair_and_pose: tuple[Pair, AbstractElements]) -> Float[Array, "point"]:
