@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import problems
 import pytest
+from workload import FOCAL, aerial
 
 import jaxro
-from benchmarks.workload import FOCAL, aerial
 from jaxro import simulation
 from jaxro.rejection import OUTCOMES, AllSubsets, DataSnooping, GraduatedNonConvexity, Recommended
 
