@@ -2,8 +2,10 @@
 
 A loss enters the adjustment as the transformed residual r sqrt(rho(r²)/r²), whose squares add up to the robust
 objective: optimum and implicit derivative are then both exact. The package's own solver reaches that optimum by steps
-with the weights rho'(r²) instead. `scale` is in units of the whitened
-residual, that is multiples of sigma, or mm where sigma is 1.
+with the weights rho'(r²) instead. `scale` is in units of the whitened residual, that is multiples of sigma, or mm where
+sigma is 1.
+
+Weights that belong to no loss in use serve the reweighting of `rejection.Reweighting` alone.
 """
 
 import abc
@@ -16,7 +18,15 @@ from jaxtyping import Array, Float
 Values = Float[Array, "..."]
 
 
-class AbstractLoss(eqx.Module):
+class AbstractWeight(eqx.Module):
+    """The factor by which reweighted least squares multiplies the weight of an observation."""
+
+    @abc.abstractmethod
+    def weight(self, s: Values) -> Values:
+        """The factor, 1 at zero, of squared whitened residuals."""
+
+
+class AbstractLoss(AbstractWeight):
     """rho(s), and from it the weight rho'(s) of iteratively reweighted least squares."""
 
     scale: eqx.AbstractVar[float]
@@ -83,3 +93,34 @@ class Tukey(AbstractLoss):
     def rho(self, s):
         left = 1 - jnp.minimum(s / self.scale**2, 1.0)
         return self.scale**2 / 3 * (1 - left**3)
+
+
+class LeastAbsolute(AbstractWeight):
+    """k / sqrt(s) outside the scale k, 1 inside: Σ |r| = min, with a small k against infinite weights."""
+
+    scale: float = 0.1
+
+    def weight(self, s):
+        return self.scale / jnp.sqrt(jnp.maximum(s, self.scale**2))
+
+
+class Danish(AbstractWeight):
+    """1 inside the scale k, exp(-factor (sqrt(s)/k)^power) outside (Krarup, Juhl and Kubik 1980; k = 2 or 3)."""
+
+    scale: float = 2.0
+    factor: float = 0.05
+    power: float = 3.0
+
+    def weight(self, s):
+        return jnp.where(s > self.scale**2, jnp.exp(-self.factor * (s / self.scale**2) ** (self.power / 2)), 1.0)
+
+
+class IggThree(AbstractWeight):
+    """1 inside k0, (k0/|r|) ((k1 - |r|) / (k1 - k0))² up to k1, zero beyond (IGG III, Yang 1994)."""
+
+    scale: float = 1.5
+    last: float = 4.5
+
+    def weight(self, s):
+        r = jnp.sqrt(jnp.maximum(s, self.scale**2))
+        return self.scale / r * (jnp.maximum(self.last - r, 0.0) / (self.last - self.scale)) ** 2

@@ -55,7 +55,7 @@ def columns(residual: Callable, x: Scalars) -> tuple[Columns, list[Columns], Non
     return [r], [[push(*(unit[k, i] for i in range(len(x))))] for k in range(len(x))], None
 
 
-def cholesky(n: Lower) -> tuple[Lower, Scalar]:
+def cholesky(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
     """L with N = L Lᵀ, the *inverses* of its diagonal in place of the diagonal, and the smallest relative pivot.
 
     The relative pivot of a parameter is the part of its diagonal that those before it leave over; pivots below the

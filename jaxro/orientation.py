@@ -16,7 +16,7 @@ from .elements import AbstractElements, DependentElements, IndependentElements, 
 from .losses import AbstractLoss
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned
-from .programs import QUICK, Program, traced
+from .programs import FAST, QUICK, Program, traced
 from .reductions import count, sums, total
 from .results import RESULTS, is_usable
 
@@ -31,9 +31,8 @@ class Orientation(eqx.Module):
     """The relative orientation of a pair; for a batch every field has leading axes.
 
     Per point (zero or False where masked): `parallax` the strict y-parallax q = y1* - y2* of the photos turned parallel
-    to the base; `residuals` the whitened residuals that were minimised; `corrections` the corrections v of (x_left,
-    y_left, x_right, y_right); `redundancy` numbers, which add up to the degrees of freedom; `model` (X, Y, Z) in the
-    frame and scale of the elements; `in_front` of both photos.
+    to the base; `residuals` the whitened residuals that were minimised; `redundancy` numbers, which add up to the
+    degrees of freedom; `model` (X, Y, Z) in the frame and scale of the elements; `in_front` of both photos.
 
     `m_q` = sqrt([qq]/(n-5)), `sigma0` = sqrt(Σ r²/(n-5)): the standard deviation of a coordinate in its own unit when
     no sigma was given, else its ratio to the given sigma. Both NaN without redundancy. `cofactor`: of the five
@@ -45,7 +44,6 @@ class Orientation(eqx.Module):
     cofactor: Float[Array, "*pairs 5 5"]
     parallax: Float[Array, "*pairs point"]
     residuals: Float[Array, "*pairs point"]
-    corrections: Coordinates
     redundancy: Float[Array, "*pairs point"]
     model: tuple[Float[Array, "*pairs point"], Float[Array, "*pairs point"], Float[Array, "*pairs point"]]
     in_front: Bool[Array, "*pairs point"]
@@ -69,6 +67,13 @@ class Orientation(eqx.Module):
     def usable(self) -> Bool[Array, "*pairs"]:
         """Whether the elements may be used; `result` says why not, or what to mind."""
         return is_usable(self.result)
+
+    def corrections(self, pair: Pair) -> Coordinates:
+        """The corrections v of (x_left, y_left, x_right, y_right) of the oriented pair, zero where masked."""
+        poses_and_pairs = self.pose, pair
+        if traced(poses_and_pairs):
+            return _corrections_of(poses_and_pairs)
+        return Program(_corrections_of, {}, FAST if jnp.ndim(self.sigma0) else QUICK)(poses_and_pairs)
 
     def check(self) -> "Orientation":
         """This orientation; raises RuntimeError with advice if any of it is not usable."""
@@ -160,14 +165,12 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     length = _length(pair, elements, base, pose)
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
-    f = coplanarity.fundamental_matrix(pose, pair.focal_left, pair.focal_right)
     frames = tuple(frame[1:] for frame in coplanarity.turned(pose))
-    each = lambda function: jax.vmap(function)(pair.coordinates, pair.mask)
-    v = each(lambda point, use: coplanarity.corrections(f, point, use))
-    parallax = each(
-        lambda point, use: jnp.where(use, coplanarity.y_parallax(frames, point, pair.focal_left, pair.focal_right), 0.0)
+    q_of = lambda point, use: jnp.where(
+        use, coplanarity.y_parallax(frames, point, pair.focal_left, pair.focal_right), 0.0
     )
-    corrected = tuple(c + dv for c, dv in zip(pair.coordinates, v, strict=True))
+    parallax = jax.vmap(q_of)(pair.coordinates, pair.mask)
+    corrected = tuple(c + dv for c, dv in zip(pair.coordinates, _corrections(pose, pair), strict=True))
     scale = _scale(chosen, pose, length)
     model, in_front, far = _model(pair, pose, corrected, chosen.model_frame(), scale)
 
@@ -201,7 +204,6 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
         q,
         parallax,
         adjustment.residuals,
-        v,
         adjustment.redundancy,
         model,
         in_front,
@@ -211,6 +213,18 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
         adjustment.iterations,
         result,
     )
+
+
+def _corrections_of(poses_and_pairs: tuple[RelativePose, Pair]) -> Coordinates:
+    if poses_and_pairs[0].qw.ndim:
+        return jax.vmap(_corrections_of)(poses_and_pairs)
+    pose, pair = poses_and_pairs
+    return _corrections(pose, cleaned(pair)[0])
+
+
+def _corrections(pose: RelativePose, pair: Pair) -> Coordinates:
+    f = coplanarity.fundamental_matrix(pose, pair.focal_left, pair.focal_right)
+    return jax.vmap(lambda point, use: coplanarity.corrections(f, point, use))(pair.coordinates, pair.mask)
 
 
 def _facing(pose: RelativePose, pair: Pair, free: bool) -> tuple[RelativePose, Bool[Array, ""]]:

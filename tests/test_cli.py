@@ -82,7 +82,7 @@ def test_files_hold_the_python_result_to_the_bit(sample, tmp_path):
     assert (row["result"], row["advice"], row["degrees_of_freedom"]) == ("successful", "", "1")
     residuals, points = rows(out / "residuals.csv"), rows(out / "points.csv")
     assert [r["point"] for r in residuals] == list("abcdef")
-    wanted = (o.parallax, *o.corrections, o.redundancy)
+    wanted = (o.parallax, *o.corrections(pair), o.redundancy)
     names = ("q_mm", "v_x_left_mm", "v_y_left_mm", "v_x_right_mm", "v_y_right_mm", "redundancy")
     np.testing.assert_array_equal([numbers(r, *names) for r in residuals], np.stack(wanted, axis=-1))
     np.testing.assert_array_equal([numbers(p, "X_mm", "Y_mm", "Z_mm") for p in points], np.stack(o.model, axis=-1))
@@ -198,9 +198,10 @@ def test_kept_programs_change_nothing_but_the_time(tmp_path, sample):
         return done.stdout
 
     first = call()
-    (program,) = (tmp_path / "kept").iterdir()
-    content = program.read_bytes()
-    assert call() == first and program.read_bytes() == content
-    program.write_bytes(content[:1000])  # cut short: compiled and written again
-    assert call() == first and len(program.read_bytes()) > 1000
-    assert call(sample, *FOCAL) != first and len(list((tmp_path / "kept").iterdir())) == 2
+    kept = {program: program.read_bytes() for program in (tmp_path / "kept").iterdir()}
+    assert len(kept) == 2  # the orientation and the corrections
+    assert call() == first and all(program.read_bytes() == content for program, content in kept.items())
+    for program, content in kept.items():
+        program.write_bytes(content[:1000])  # cut short: compiled and written again
+    assert call() == first and all(len(program.read_bytes()) > 1000 for program in kept)
+    assert call(sample, *FOCAL) != first and len(list((tmp_path / "kept").iterdir())) == 3

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from .. import coplanarity
 from ..batch import clean_batch, orient_batch
 from ..elements import AbstractElements
-from ..orientation import Orientation, orient
+from ..orientation import orient
 from ..pairs import Pair, stack
 from ..programs import QUICK, Program
 from ..rejection import PROCEDURES, AbstractProcedure
@@ -18,7 +18,7 @@ from . import files, job as jobs, mock_example, verdict_report, verdicts as judg
 from .buckets import each
 from .console import consoles, progress
 from .job import Example, Job, Options
-from .solutions import solutions
+from .solutions import Solved, solutions, with_corrections
 from .tables import TableError
 from .tolerances import changed, judges_by_sigma, tolerances
 from .verdicts import Verdict
@@ -71,26 +71,28 @@ def named(name: str) -> AbstractProcedure:
 
 def clean_all(
     job: Job, procedure: AbstractProcedure, told: Callable[[int], None]
-) -> tuple[list[Verdict], list[Orientation]]:
+) -> tuple[list[Verdict], list[Solved]]:
     """The verdict on every pair, with the log if files are asked for, and the orientation of the points kept."""
     select = judged.without_log if job.options.out is None else judged.with_log
 
     def one(pair: Pair):
         found, log = jax.tree.map(lambda a: a[0], clean_batch(stack([pair]), procedure, select=select))
-        oriented = orient(pair.with_mask(found.kept), **job.keywords)
-        return found, log, oriented, Program(_parallaxes, {}, QUICK)((pair, oriented.pose))
+        kept = pair.with_mask(found.kept)
+        oriented = with_corrections(orient(kept, **job.keywords), kept)
+        return found, log, oriented, Program(_parallaxes, {}, QUICK)((pair, oriented.orientation.pose))
 
     def many(batch: Pair, progress: Callable[[int, int], None]):
         found, log = clean_batch(batch, procedure, select=select, progress=progress)
-        oriented = orient_batch(batch.with_mask(found.kept), **job.keywords)
-        return found, log, oriented, Program(_all_parallaxes, {})((batch, oriented.pose))
+        kept = batch.with_mask(found.kept)
+        oriented = with_corrections(orient_batch(kept, **job.keywords), kept)
+        return found, log, oriented, Program(_all_parallaxes, {})((batch, oriented.orientation.pose))
 
     together = (lambda points: 1 << 40) if job.options.out is None else lambda points: max(1, LOG_NUMBERS // points**2)
     verdicts: dict[int, Verdict] = {}
-    oriented: dict[int, Orientation] = {}
-    for i, (found, log, orientation, parallax) in each(job.pairs, one, many, told, together):
+    oriented: dict[int, Solved] = {}
+    for i, (found, log, solved, parallax) in each(job.pairs, one, many, told, together):
         verdicts[i] = judged.verdict(job.table.pairs[i], found, parallax, log)
-        oriented[i] = _of_points(orientation, np.flatnonzero(found.kept))
+        oriented[i] = _of_points(solved, np.flatnonzero(found.kept))
     every = range(len(job.pairs))
     return [verdicts[i] for i in every], [oriented[i] for i in every]
 
@@ -108,9 +110,12 @@ def _all_parallaxes(pairs_and_poses: tuple[Pair, AbstractElements]) -> Float[Arr
     return jax.vmap(_parallaxes)(pairs_and_poses)
 
 
-def _of_points(orientation: Orientation, places: np.ndarray) -> Orientation:
+def _of_points(solved: Solved, places: np.ndarray) -> Solved:
     """The orientation with the values of these points only."""
     if not places.size:
-        return orientation
-    values = lambda o: (o.parallax, o.residuals, o.corrections, o.redundancy, o.model, o.in_front)
-    return eqx.tree_at(values, orientation, jax.tree.map(lambda a: a[places], values(orientation)))
+        return solved
+    values = lambda s: (
+        s.corrections,
+        *(getattr(s.orientation, name) for name in ("parallax", "residuals", "redundancy", "model", "in_front")),
+    )
+    return eqx.tree_at(values, solved, jax.tree.map(lambda a: a[places], values(solved)))

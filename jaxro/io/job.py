@@ -11,12 +11,12 @@ from rich.console import Console
 from .. import coplanarity
 from ..batch import orient_batch
 from ..elements import AbstractElements, DependentElements, IndependentElements, RelativePose
-from ..orientation import Orientation, orient
+from ..orientation import orient
 from ..pairs import Camera, Pair
 from . import cameras as camera_files, example, files, report, tables
 from .buckets import each
 from .console import consoles, progress
-from .solutions import Solution, Units, solutions
+from .solutions import Solution, Solved, Units, solutions, with_corrections
 from .tables import TableError
 
 SYSTEMS: dict[str, type[AbstractElements]] = {
@@ -217,15 +217,15 @@ def _check_numbers(options: Options, table: tables.Table, system: type[AbstractE
             raise TableError("--base", None, None, repr(options.base), allowed)
 
 
-def orient_all(pairs: list[Pair], keywords: dict[str, Any], progress: Callable[[int], None]) -> list[Orientation]:
+def orient_all(pairs: list[Pair], keywords: dict[str, Any], progress: Callable[[int], None]) -> list[Solved]:
     """Every pair oriented, in order, as NumPy values; padding of many pairs is left in place.
 
     `progress` is told the number of pairs finished so far.
     """
     found = each(
         pairs,
-        lambda pair: orient(pair, **keywords),
-        lambda batch, told: orient_batch(batch, progress=told, **keywords),
+        lambda pair: with_corrections(orient(pair, **keywords), pair),
+        lambda batch, told: with_corrections(orient_batch(batch, progress=told, **keywords), batch),
         progress,
     )
-    return [orientation for _, orientation in sorted(found, key=lambda entry: entry[0])]
+    return [one for _, one in sorted(found, key=lambda entry: entry[0])]

@@ -118,7 +118,7 @@ def layout_of(options: Options, warnings: Any) -> tuple[str, Pair]:
         raise TableError(
             "--sigma", None, None, "none, and no sigma0 from the pair", "the standard deviation to simulate"
         )
-    x_left, y_left, x_right, y_right = solved.corrections
+    x_left, y_left, x_right, y_right = solved.corrections(pair)
     exact = simulation.planted(pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right)
     size = f"{float(jnp.mean(sigma)):.3g} {options.unit}"
     return f"{measured.name}, {len(measured.points)} points, sigma {size}", _with_sigma(exact, sigma)

@@ -6,7 +6,7 @@ sigma0 are NaN here; the y-parallaxes, corrections and `in_front` stay where the
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ import numpy as np
 from .. import rotations as rot
 from ..elements import DependentElements, RelativePose
 from ..orientation import Orientation
-from ..pairs import Camera
+from ..pairs import Camera, Coordinates, Pair
 from ..results import RESULTS
 from .tables import Measurements
 
@@ -48,6 +48,18 @@ class Element:
     deviation: float | None
 
 
+class Solved(NamedTuple):
+    """An orientation as it comes from the engine, with the corrections of the coordinates."""
+
+    orientation: Orientation
+    corrections: Coordinates
+
+
+def with_corrections(orientation: Orientation, pair: Pair) -> Solved:
+    """The orientation of a pair (or of a batch) with its corrections."""
+    return Solved(orientation, orientation.corrections(pair))
+
+
 @dataclass(frozen=True)
 class Solution:
     """One pair, its cameras, its finished orientation and the elements that are shown."""
@@ -55,6 +67,7 @@ class Solution:
     measured: Measurements
     cameras: tuple[Camera, Camera]
     orientation: Orientation
+    corrections: tuple[np.ndarray, ...]
     elements: list[Element]
 
     @cached_property
@@ -86,7 +99,7 @@ class Solution:
         o = self.orientation
         shown = self.usable or self.result == "points_behind_camera"
         count = len(self.measured.points)  # padding comes after them
-        numbers = np.stack([o.parallax, *o.corrections, o.redundancy, *o.model])[:, :count]
+        numbers = np.stack([o.parallax, *self.corrections, o.redundancy, *o.model])[:, :count]
         if not shown:
             numbers = np.full_like(numbers, np.nan)
         elif not self.usable:
@@ -159,15 +172,16 @@ def shown_elements(orientations: list[Orientation], units: Units) -> list[list[E
 def solutions(
     measured: list[Measurements],
     cameras: list[tuple[Camera, Camera]],
-    orientations: list[Orientation],
+    found: list[Solved],
     units: Units,
 ) -> list[Solution]:
     """One `Solution` a pair, the elements of unusable ones NaN."""
     out = []
-    for m, c, o, elements in zip(measured, cameras, orientations, shown_elements(orientations, units), strict=True):
-        solution = Solution(m, c, o, elements)
+    shown = shown_elements([o for o, _ in found], units)
+    for m, c, (o, v), elements in zip(measured, cameras, found, shown, strict=True):
+        solution = Solution(m, c, o, v, elements)
         if not solution.usable:
             blank = [Element(e.name, e.unit, np.nan, None if e.deviation is None else np.nan) for e in elements]
-            solution = Solution(m, c, o, blank)
+            solution = Solution(m, c, o, v, blank)
         out.append(solution)
     return out

@@ -4,15 +4,18 @@ Each is an object with its tolerances as fields: `procedure(pair) -> Rejection`,
 is the one list of them.
 """
 
+from .. import losses
 from .all_subsets import AllSubsets as AllSubsets
 from .base import OUTCOMES as OUTCOMES, AbstractProcedure as AbstractProcedure, Log as Log, Rejection as Rejection
 from .data_snooping import DataSnooping as DataSnooping
 from .dorozhinsky import Dorozhinsky as Dorozhinsky
 from .graduated_non_convexity import GraduatedNonConvexity as GraduatedNonConvexity
+from .least_median import LeastMedian as LeastMedian
 from .leave_one_out_grubbs import LeaveOneOutGrubbs as LeaveOneOutGrubbs, calibrated as calibrated
 from .mean_parallax import MeanParallax as MeanParallax
 from .ransac import Ransac as Ransac
 from .recommended import Recommended as Recommended
+from .reweighting import Reweighting as Reweighting
 from .three_sigma import ThreeSigma as ThreeSigma
 from .two_stage import TwoStage as TwoStage
 from .worst_point import WorstPoint as WorstPoint
@@ -26,6 +29,14 @@ PROCEDURES: dict[str, AbstractProcedure] = {
     "two-stage": TwoStage(),
     "data-snooping": DataSnooping(),
     "tau": DataSnooping(estimated=True),
+    "huber": Reweighting(losses.Huber()),
+    "cauchy": Reweighting(losses.Cauchy()),
+    "tukey": Reweighting(losses.Tukey()),
+    "danish": Reweighting(losses.Danish()),
+    "igg3": Reweighting(losses.IggThree()),
+    "least-absolute": Reweighting(losses.LeastAbsolute()),
+    "least-median": LeastMedian(),
+    "ransac": Ransac(),
     "graduated": GraduatedNonConvexity(),
     "all-subsets": AllSubsets(),
     "recommended": Recommended(),

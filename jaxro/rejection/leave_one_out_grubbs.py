@@ -157,7 +157,7 @@ def calibrated(
     """
     pair = cleaned(pair)[0]
     solved = orient(pair)
-    x_left, y_left, x_right, y_right = solved.corrections
+    x_left, y_left, x_right, y_right = solved.corrections(pair)
     exact = planted(pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right)
     size = 1e-5 * pair.focal_left
     used = int(count(pair.mask))

@@ -92,17 +92,19 @@ def reweighted(pair: Pair, pose: RelativePose, weight: Callable[[Values], Values
     return stepped(pose, linear, linear.weight * weight(linear.squares))
 
 
-def normalised(linear: Linear, use: Use) -> Values:
-    """|w| of all points against the solution of those in use.
+def normalised(linear: Linear, share: Use | Values) -> Values:
+    """|w| of all points against the solution of those in use, or of all with a `share` of their weights.
 
-    A point in use has the variance 1 - h, h = a N⁻¹ aᵀ its leverage; one not in use has 1 + h.
+    A point in use has the variance 1 - h, h = a N⁻¹ aᵀ its leverage; one not in use has 1 + h;
+    in between it is 1 + (1 - 2p) h.
     """
-    weight = jnp.where(use, linear.weight, 0.0)
+    share = share.astype(linear.weight.dtype)
+    weight = linear.weight * share
     n, _, _ = accumulate([linear.g], [[c] for c in linear.columns], [weight])
     z = substitute(cholesky(n)[0], linear.columns)
     h = linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True))
     h = jnp.where(jnp.isfinite(h), h, 1.0)
-    variance = jnp.where(use, jnp.maximum(1 - h, 1e-6), 1 + h)
+    variance = jnp.maximum(1 + (1 - 2 * share) * h, 1e-6)
     return jnp.sqrt(linear.squares / variance)
 
 
