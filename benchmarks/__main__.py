@@ -18,11 +18,14 @@ def machine() -> str:
 
 
 def main() -> int:
-    from .engine import QUICK, SUITES, Size
+    from . import engine, rejection
+    from .common import QUICK, Size
+
+    suites = engine.SUITES | rejection.SUITES
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few pairs, few repeats: does it run, roughly how fast")
-    parser.add_argument("--only", choices=SUITES, action="append", help="this suite alone (may be repeated)")
+    parser.add_argument("--only", choices=suites, action="append", help="this suite alone (may be repeated)")
     parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results.md")
     parser.add_argument(
         "--gate", action="store_true", help="fail where a figure is worse than the committed one allows"
@@ -32,8 +35,8 @@ def main() -> int:
         parser.error("--write takes a whole run: the table's figures stand beside each other")
 
     measured = []
-    for name in options.only or SUITES:
-        found = SUITES[name](QUICK if options.quick else Size())
+    for name in options.only or suites:
+        found = suites[name](QUICK if options.quick else Size())
         print(name, *(metric.row() for metric in found), sep="\n", file=sys.stderr, flush=True)  # a run takes minutes
         measured += found
     print(f"{machine()}\n\n{contract.table(measured)}")

@@ -1,4 +1,4 @@
-"""The suites: each compares answers, then times, and returns its metrics."""
+"""The suites of the engine: each compares answers, then times, and returns its metrics."""
 
 import os
 import shutil
@@ -7,14 +7,11 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 import jaxro
 from jaxro import coplanarity, starts
@@ -22,69 +19,9 @@ from jaxro.orientation import orient_near
 from jaxro.programs import QUICK as QUICK_PROGRAM
 
 from . import peers
+from .common import Size, agreement, pair_of, pose, poses, rate, ratio, ready, share
 from .metrics import Metric, median_seconds
-from .workload import FOCAL, aerial
-
-Poses = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""R (pairs, 3, 3) and unit base (pairs, 3)"""
-
-
-@dataclass(frozen=True)
-class Size:
-    """How much is measured: pairs by number of points, the share of them the slower peers get, repeats."""
-
-    pairs: dict[int, int] = field(default_factory=lambda: {16: 131_072, 200: 16_384, 1000: 4_096})
-    peer_share: int = 4
-    repeats: int = 7
-    processes: int = 5
-    calls: int = 200
-
-
-QUICK = Size({16: 8_192, 200: 1_024, 1000: 256}, peer_share=4, repeats=3, processes=1, calls=20)
-
-
-def _share(coordinates: peers.Coordinates, pairs: int) -> peers.Coordinates:
-    return tuple(c[:pairs] for c in coordinates)
-
-
-def _pair(coordinates: peers.Coordinates) -> jaxro.Pair:
-    return jaxro.pair(*coordinates, focal=FOCAL)
-
-
-def _ready(call: Callable, *arguments: Any) -> Any:
-    return jax.block_until_ready(call(*arguments))
-
-
-def _poses(pose: jaxro.RelativePose) -> Poses:
-    rotation, base = pose.relative()
-    return np.moveaxis(np.array(rotation), (0, 1), (-2, -1)), np.moveaxis(np.array(base), 0, -1)
-
-
-def _difference(one: Poses, other: Poses) -> float:
-    """The largest difference of any entry of R or of the unit base: radians, for small ones."""
-    count = min(len(one[0]), len(other[0]))
-    return max(float(np.max(np.abs(a[:count] - b[:count]))) for a, b in zip(one, other, strict=True))
-
-
-def _agreement(key: str, ours: Poses, theirs: Poses, bound: float) -> Metric:
-    """The metric of an accuracy comparison. Raises ArithmeticError beyond `bound`: nothing is timed then."""
-    difference = _difference(ours, theirs)
-    if not difference <= bound:
-        raise ArithmeticError(f"{key}: the answers differ by {difference:.1e}, more than {bound:.0e}; nothing timed")
-    return Metric(key, difference, "rad", "lower", tolerance=np.inf, goal=bound)
-
-
-def _rate(key: str, seconds: float) -> Metric:
-    return Metric(key, seconds * 1e6, "µs a pair", "lower", tolerance=0.5)
-
-
-def _ratio(key: str, peer: float, ours: float, goal: float | None) -> Metric:
-    return Metric(key, peer / ours, "times", "higher", goal=goal)
-
-
-def _pose(orientation: jaxro.Orientation) -> jaxro.RelativePose:
-    """What the peers compute; the rest is then not computed by ours either."""
-    return orientation.pose
+from .workload import aerial
 
 
 def refinement(size: Size) -> list[Metric]:
@@ -93,33 +30,33 @@ def refinement(size: Size) -> list[Metric]:
     for points, pairs in size.pairs.items():
         goal, stock_goal = (8, 20) if points == 16 else (10, None)
         coordinates, label = aerial(pairs, points), f"rigorous, {points} points"
-        ours, few = _pair(coordinates), _share(coordinates, pairs // size.peer_share)
-        part = _share(coordinates, min(len(few[0]), 10_000))
+        ours, few = pair_of(coordinates), share(coordinates, pairs // size.peer_share)
+        part = share(coordinates, min(len(few[0]), 10_000))
         contestants: dict[str, Callable] = {
-            "pose": partial(_ready, partial(jaxro.orient_batch, select=_pose), ours),
-            "whole": partial(_ready, jaxro.orient_batch, ours),
-            "optimistix": partial(_ready, peers.stock_optimistix(), *part),
+            "pose": partial(ready, partial(jaxro.orient_batch, select=pose), ours),
+            "whole": partial(ready, jaxro.orient_batch, ours),
+            "optimistix": partial(ready, peers.stock_optimistix(), *part),
         }
         answers = {name: call() for name, call in contestants.items()}
-        pose, whole = _poses(answers["pose"]), _poses(answers["whole"].pose)
-        with peers.PoseLib(few, processes=2) as poselib:
+        alone, whole = poses(answers["pose"]), poses(answers["whole"].pose)
+        with peers.Peer(peers.refinement, few, processes=2) as poselib:
             metrics += [
-                _agreement(f"{label}: difference from PoseLib", pose, poselib.refined(), 1e-8),
-                _agreement(f"{label}: difference from optimistix", pose, peers.as_poses(answers["optimistix"]), 1e-9),
-                _agreement(f"{label}: pose alone or in the whole", pose, whole, 1e-9),
+                agreement(f"{label}: difference from PoseLib", alone, poselib.refined(), 1e-8),
+                agreement(f"{label}: difference from optimistix", alone, peers.as_poses(answers["optimistix"]), 1e-9),
+                agreement(f"{label}: pose alone or in the whole", alone, whole, 1e-9),
             ]
             del answers
-            seconds = median_seconds({**contestants, "poselib": poselib.refine}, size.repeats)
+            seconds = median_seconds({**contestants, "poselib": poselib.run}, size.repeats)
         each = {"pose": pairs, "whole": pairs, "optimistix": len(part[0]), "poselib": len(few[0])}
         per_pair = {name: seconds[name] / count for name, count in each.items()}
         metrics += [
-            _rate(f"{label}: jaxro, pose", per_pair["pose"]),
-            _rate(f"{label}: jaxro, whole Orientation", per_pair["whole"]),
-            _rate(f"{label}: PoseLib in two processes", per_pair["poselib"]),
-            _rate(f"{label}: optimistix under vmap", per_pair["optimistix"]),
-            _ratio(f"{label}: pose against PoseLib in two processes", per_pair["poselib"], per_pair["pose"], goal),
-            _ratio(f"{label}: pose against optimistix", per_pair["optimistix"], per_pair["pose"], stock_goal),
-            _ratio(f"{label}: whole against PoseLib in two processes", per_pair["poselib"], per_pair["whole"], None),
+            rate(f"{label}: jaxro, pose", per_pair["pose"]),
+            rate(f"{label}: jaxro, whole Orientation", per_pair["whole"]),
+            rate(f"{label}: PoseLib in two processes", per_pair["poselib"]),
+            rate(f"{label}: optimistix under vmap", per_pair["optimistix"]),
+            ratio(f"{label}: pose against PoseLib in two processes", per_pair["poselib"], per_pair["pose"], goal),
+            ratio(f"{label}: pose against optimistix", per_pair["optimistix"], per_pair["pose"], stock_goal),
+            ratio(f"{label}: whole against PoseLib in two processes", per_pair["poselib"], per_pair["whole"], None),
             Metric(f"{label}: whole against pose", per_pair["whole"] / per_pair["pose"], "times", "lower", goal=2),
         ]
     return metrics
@@ -128,45 +65,45 @@ def refinement(size: Size) -> list[Metric]:
 def parallax(size: Size) -> list[Metric]:
     """Strict y-parallax at 16 points on the whole machine, against PoseLib in two processes."""
     coordinates = aerial(size.pairs[16], 16)
-    ours, few = _pair(coordinates), _share(coordinates, size.pairs[16] // size.peer_share)
-    orient = partial(_ready, partial(jaxro.orient_batch, residual=coplanarity.parallax, select=_pose), ours)
-    check = peers.scipy_parallax(_share(coordinates, 32))
-    metrics = [_agreement("parallax, 16 points: difference from SciPy", _poses(orient()), check, 1e-7)]
-    with peers.PoseLib(few, processes=2) as poselib:
-        seconds = median_seconds({"jaxro": orient, "poselib": poselib.refine}, size.repeats)
+    ours, few = pair_of(coordinates), share(coordinates, size.pairs[16] // size.peer_share)
+    orient = partial(ready, partial(jaxro.orient_batch, residual=coplanarity.parallax, select=pose), ours)
+    check = peers.scipy_parallax(share(coordinates, 32))
+    metrics = [agreement("parallax, 16 points: difference from SciPy", poses(orient()), check, 1e-7)]
+    with peers.Peer(peers.refinement, few, processes=2) as poselib:
+        seconds = median_seconds({"jaxro": orient, "poselib": poselib.run}, size.repeats)
     ours_each, peer_each = seconds["jaxro"] / size.pairs[16], seconds["poselib"] / len(few[0])
     return [
         *metrics,
-        _rate("parallax, 16 points: jaxro, pose", ours_each),
-        _ratio("parallax, 16 points: pose against PoseLib in two processes", peer_each, ours_each, goal=10),
+        rate("parallax, 16 points: jaxro, pose", ours_each),
+        ratio("parallax, 16 points: pose against PoseLib in two processes", peer_each, ours_each, goal=10),
     ]
 
 
 def users_own(size: Size) -> list[Metric]:
     """jax.jit(jax.vmap(orient)), default flags, against PoseLib in one process; the whole against its pose alone."""
     coordinates = aerial(size.pairs[16] // 2, 16)
-    ours, few = _pair(coordinates), _share(coordinates, size.pairs[16] // size.peer_share // 2)
+    ours, few = pair_of(coordinates), share(coordinates, size.pairs[16] // size.peer_share // 2)
     contestants: dict[str, Callable] = {
-        "whole": partial(_ready, jax.jit(jax.vmap(jaxro.orient)), ours),
-        "pose": partial(_ready, jax.jit(jax.vmap(lambda pair: jaxro.orient(pair).pose)), ours),
+        "whole": partial(ready, jax.jit(jax.vmap(jaxro.orient)), ours),
+        "pose": partial(ready, jax.jit(jax.vmap(lambda pair: jaxro.orient(pair).pose)), ours),
     }
     answers = {name: call() for name, call in contestants.items()}
-    with peers.PoseLib(few, processes=1) as poselib:
+    with peers.Peer(peers.refinement, few, processes=1) as poselib:
         metrics = [
-            _agreement(
-                "jit(vmap(orient)): difference from PoseLib", _poses(answers["whole"].pose), poselib.refined(), 1e-8
+            agreement(
+                "jit(vmap(orient)): difference from PoseLib", poses(answers["whole"].pose), poselib.refined(), 1e-8
             )
         ]
         del answers
-        seconds = median_seconds({**contestants, "poselib": poselib.refine}, size.repeats)
+        seconds = median_seconds({**contestants, "poselib": poselib.run}, size.repeats)
     pairs = len(coordinates[0])
     one_process = seconds["poselib"] / len(few[0])
     return [
         *metrics,
-        _rate("jit(vmap(orient)), 16 points: whole Orientation", seconds["whole"] / pairs),
-        _rate("jit(vmap(orient)), 16 points: pose alone", seconds["pose"] / pairs),
-        _rate("PoseLib in one process, 16 points", one_process),
-        _ratio("jit(vmap(orient)): against PoseLib in one process", one_process, seconds["whole"] / pairs, goal=3),
+        rate("jit(vmap(orient)), 16 points: whole Orientation", seconds["whole"] / pairs),
+        rate("jit(vmap(orient)), 16 points: pose alone", seconds["pose"] / pairs),
+        rate("PoseLib in one process, 16 points", one_process),
+        ratio("jit(vmap(orient)): against PoseLib in one process", one_process, seconds["whole"] / pairs, goal=3),
         Metric("jit(vmap(orient)): whole against pose", seconds["whole"] / seconds["pose"], "times", "lower", goal=2),
     ]
 
@@ -183,7 +120,7 @@ def _repeated(call: Callable, pair: jaxro.Pair) -> None:
 def latency(size: Size) -> list[Metric]:
     """One near-vertical pair of 16 points: the compiled function inside `orient`, for the pose as peers return it and
     for the whole Orientation, then `orient` and `jit(orient)` as called."""
-    pair = jax.device_put(_pair(tuple(c[0] for c in aerial(1, 16))))
+    pair = jax.device_put(pair_of(tuple(c[0] for c in aerial(1, 16))))
     near = partial(orient_near, start=starts.Auto(steps=0))
     orient = jax.jit(jaxro.orient)
     calls: dict[str, Callable] = {

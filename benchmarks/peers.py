@@ -1,4 +1,4 @@
-"""The peers: PoseLib in processes of its own, and the stock optimistix Gauss-Newton under vmap.
+"""The peers: PoseLib and OpenCV in processes of their own, and the stock optimistix Gauss-Newton under vmap.
 
 PoseLib's image vector is (x, y, 1), ours (x, y, -f): with both coordinates negated they are parallel, so that its
 R and t are Rᵀ and -Rᵀ b of ours.
@@ -7,6 +7,7 @@ R and t are Rᵀ and -Rᵀ b of ours.
 import multiprocessing
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,69 +15,161 @@ from numpy.typing import NDArray
 from .workload import FOCAL
 
 Coordinates = Sequence[NDArray[np.float64]]
+ORDINARY = {"loss_type": "TRIVIAL"}
 TIGHT = {"loss_type": "TRIVIAL", "max_iterations": 100, "gradient_tol": 1e-16, "step_tol": 1e-13}
 
 
-def _refine(left: NDArray, right: NDArray, options: dict) -> list:
-    """PoseLib's refinement of every pair from the normal case (no rotation, base along x), by its quickest call."""
+Work = Callable[[dict], list]
+"""All pairs of a process once, with the options given, as the peer answers."""
+
+
+def _camera():
     import poselib
 
-    camera = poselib.Camera("SIMPLE_PINHOLE", [FOCAL, 0.0, 0.0], 300, 300)
+    return poselib.Camera("SIMPLE_PINHOLE", [FOCAL, 0.0, 0.0], 300, 300)
+
+
+def _normal_case():
+    """No rotation, base along x."""
+    import poselib
+
     start = poselib.CameraPose()
     start.t = np.array([-1.0, 0.0, 0.0])
-    return [
+    return start
+
+
+def refinement(left: NDArray, right: NDArray) -> Work:
+    """PoseLib's refinement of every pair from the normal case, by its quickest call."""
+    import poselib
+
+    camera, start = _camera(), _normal_case()
+    return lambda options: [
         poselib.refine_relative_pose(one, other, start, camera, camera, options)[0]
         for one, other in zip(left, right, strict=True)
     ]
 
 
-def _serve(connection: Connection, coordinates: Coordinates) -> None:
-    """Refines all its pairs each time it is told to; sends the poses back where they are wanted."""
-    left = -np.stack(coordinates[:2], axis=-1)
-    right = -np.stack(coordinates[2:], axis=-1)
+def omissions(left: NDArray, right: NDArray) -> Work:
+    """The same, and from that solution once more for every point left out, the points copied beforehand."""
+    import poselib
+
+    camera, start = _camera(), _normal_case()
+    every = range(left.shape[1])
+    without = [[(np.delete(a, i, 0), np.delete(b, i, 0)) for i in every] for a, b in zip(left, right, strict=True)]
+
+    def run(options: dict) -> list:
+        found = []
+        for one, other, rest in zip(left, right, without, strict=True):
+            full = poselib.refine_relative_pose(one, other, start, camera, camera, options)[0]
+            found.append([poselib.refine_relative_pose(a, b, full, camera, camera, options)[0] for a, b in rest])
+        return found
+
+    return run
+
+
+def ransac(left: NDArray, right: NDArray) -> Work:
+    """PoseLib's LO-RANSAC of every pair."""
+    import poselib
+
+    camera = _camera()
+
+    def run(options: dict) -> list:
+        return [
+            poselib.estimate_relative_pose(one, other, camera, camera, options, {})
+            for one, other in zip(left, right, strict=True)
+        ]
+
+    return run
+
+
+def opencv(left: NDArray, right: NDArray) -> Work:
+    """OpenCV's essential matrix by the method named, decomposed."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    k = np.diag([FOCAL, FOCAL, 1.0])
+    nothing = np.full((3, 3), np.nan), np.full(3, np.nan)
+
+    def one(a: NDArray, b: NDArray, options: dict) -> tuple:
+        method, threshold = getattr(cv2, options["method"]), options["threshold"]
+        e, mask = cv2.findEssentialMat(a, b, k, method=method, prob=0.999, threshold=threshold)
+        if e is None or e.shape != (3, 3):
+            return *nothing, np.zeros(len(a), bool)
+        _, r, t, _ = cv2.recoverPose(e, a, b, k, mask=mask.copy())
+        return r, t.ravel(), mask.ravel().astype(bool)
+
+    return lambda options: [one(a, b, options) for a, b in zip(left, right, strict=True)]
+
+
+def _ours(answer) -> Any:
+    """(R, b) of a refinement, which does not look at the sign of the base; (R, b, agreeing points) of a search."""
+    if isinstance(answer, list):
+        return [_ours(one) for one in answer]
+    if isinstance(answer, tuple):
+        r, t, *mask = (answer[0].R, answer[0].t, answer[1]["inliers"]) if len(answer) == 2 else answer
+        rotation = np.array(r).T
+        return rotation, rotation @ np.array(t), *(np.array(m, bool) for m in mask)
+    rotation = np.array(answer.R).T
+    return rotation, -rotation @ np.array(answer.t)
+
+
+def _serve(connection: Connection, coordinates: Coordinates, task: Callable[[NDArray, NDArray], Work]) -> None:
+    """Does all its pairs each time it is told to; sends the answers back where they are wanted."""
+    work = task(-np.stack(coordinates[:2], axis=-1), -np.stack(coordinates[2:], axis=-1))
+    connection.send(None)
     while (order := connection.recv()) is not None:
         options, wanted = order
-        poses = _refine(left, right, options)
-        connection.send([(np.array(pose.R).T, np.array(pose.t)) for pose in poses] if wanted else None)
+        answers = work(options)
+        connection.send(_ours(answers) if wanted else None)
 
 
-class PoseLib:
-    """PoseLib's Python wheel in several processes, each with its own share of the pairs, waiting between the runs."""
+class Peer:
+    """A peer in several processes, each with its own share of the pairs, waiting between the runs."""
 
-    def __init__(self, coordinates: Coordinates, processes: int):
+    def __init__(self, task: Callable[[NDArray, NDArray], Work], coordinates: Coordinates, processes: int):
         context = multiprocessing.get_context("spawn")
         self.pairs = len(coordinates[0])
         self._connections, self._workers = [], []
         for share in np.array_split(np.arange(self.pairs), processes):
             ours, theirs = context.Pipe()
-            worker = context.Process(target=_serve, args=(theirs, [c[share] for c in coordinates]), daemon=True)
+            arguments = theirs, [c[share] for c in coordinates], task
+            worker = context.Process(target=_serve, args=arguments, daemon=True)
             worker.start()
             self._connections.append(ours)
             self._workers.append(worker)
+        for connection in self._connections:
+            connection.recv()
 
-    def refine(self) -> None:
-        """All pairs once, with the wheel's default tolerances."""
-        self._all({"loss_type": "TRIVIAL"}, wanted=False)
+    def run(self, options: dict | None = None) -> None:
+        """All pairs once; a refinement with the wheel's default tolerances if no options are given."""
+        self._all(ORDINARY if options is None else options, wanted=False)
+
+    def answers(self, options: dict) -> list:
+        """The answers of all pairs."""
+        return [answer for share in self._all(options, wanted=True) for answer in share]
 
     def refined(self) -> tuple[NDArray, NDArray]:
         """R (pairs, 3, 3) and unit base (pairs, 3) in our convention, iterated to the end."""
-        answers = [pose for share in self._all(TIGHT, wanted=True) for pose in share]
-        rotation = np.stack([r for r, _ in answers])
-        base = -np.einsum("pij,pj->pi", rotation, np.stack([t for _, t in answers]))
-        return rotation, base / np.linalg.norm(base, axis=-1, keepdims=True)
+        return stacked(self.answers(TIGHT))
 
     def _all(self, options: dict, wanted: bool) -> list:
         for connection in self._connections:
             connection.send((options, wanted))
         return [connection.recv() for connection in self._connections]
 
-    def __enter__(self) -> "PoseLib":
+    def __enter__(self) -> "Peer":
         return self
 
     def __exit__(self, *_: object) -> None:
         for connection, worker in zip(self._connections, self._workers, strict=True):
             connection.send(None)
             worker.join()
+
+
+def stacked(poses: Sequence[tuple]) -> tuple[NDArray, NDArray]:
+    """R (pairs, 3, 3) and unit base (pairs, 3) of (R, b, ...)."""
+    rotation, base = (np.stack([pose[k] for pose in poses]) for k in (0, 1))
+    return rotation, base / np.linalg.norm(base, axis=-1, keepdims=True)
 
 
 def stock_optimistix() -> Callable:

@@ -1,7 +1,12 @@
-"""The pairs every competitor orients: near-vertical aerial photographs with measuring noise."""
+"""The pairs every competitor orients."""
 
+from collections.abc import Sequence
+
+import jax
 import numpy as np
 from numpy.typing import NDArray
+
+from jaxro import simulation
 
 FOCAL = 150.0
 """mm"""
@@ -28,3 +33,22 @@ def aerial(pairs: int, points: int, *, sigma: float = 0.01, seed: int = 0) -> tu
     right = np.einsum("pij,pnj->pni", m, ground - station[:, None])
     photos = [-FOCAL * image[..., axis] / image[..., 2] for image in (ground, right) for axis in (0, 1)]
     return tuple(coordinate + rng.normal(0, sigma, shape) for coordinate in photos)
+
+
+def any_position(pairs: int, points: int, *, sigma: float = 0.01, seed: int = 0) -> tuple[NDArray[np.float64], ...]:
+    """The same for photos in any position: any turn about the axes, axes up to 70° apart, base in any direction."""
+    exact, _ = simulation.random_pairs(jax.random.key(seed), pairs, points, focal=FOCAL)
+    rng = np.random.default_rng(seed)
+    return tuple(np.asarray(c) + rng.normal(0, sigma, c.shape) for c in exact.coordinates)
+
+
+def with_wrong_points(
+    coordinates: Sequence[NDArray[np.float64]], share: float, *, size: tuple[float, float] = (1.0, 10.0), seed: int = 0
+) -> tuple[tuple[NDArray[np.float64], ...], NDArray[np.bool_]]:
+    """The pairs with this share of their points shifted in the right photo, by `size` mm in any direction; which."""
+    rng = np.random.default_rng(seed)
+    x_left, y_left, x_right, y_right = coordinates
+    wrong = np.argsort(rng.random(x_left.shape), axis=1) < round(share * x_left.shape[1])
+    length, direction = rng.uniform(*size, x_left.shape), rng.uniform(0, 2 * np.pi, x_left.shape)
+    shift = wrong * length
+    return (x_left, y_left, x_right + shift * np.cos(direction), y_right + shift * np.sin(direction)), wrong

@@ -20,7 +20,7 @@ from . import (
     starts as starts,
 )
 from .adjustment import Adjustment as Adjustment, adjust as adjust
-from .batch import clean_batch as clean_batch, orient_batch as orient_batch
+from .batch import clean_batch as clean_batch, map_batch as map_batch, orient_batch as orient_batch
 from .elements import (
     AbstractElements as AbstractElements,
     DependentElements as DependentElements,

@@ -14,7 +14,7 @@ from jaxro.rejection import OUTCOMES, AllSubsets, DataSnooping, GraduatedNonConv
 
 RECOMMENDED = Recommended(sigma=0.01)
 NEAR = dataclasses.replace(
-    RECOMMENDED, searches=RECOMMENDED.searches[:3], accidents=RECOMMENDED.accidents[:3], level=0.01
+    RECOMMENDED, searches=RECOMMENDED.searches[:4], accidents=RECOMMENDED.accidents[:4], level=0.01
 )
 """Without the search for photos in any position, which takes long to compile."""
 

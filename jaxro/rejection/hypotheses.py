@@ -1,6 +1,7 @@
-"""Random subsets of five points and the orientations they have: what `Ransac` and `LeastMedian` choose from."""
+"""Random subsets of a few points and the orientations they have: what `Ransac` and `LeastMedian` choose from."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -18,6 +19,7 @@ from ..programs import stage
 from ..reductions import count
 from ..starts import AbstractStart, Vertical
 from ..starts.decomposition import best_pose
+from ..starts.eight_point import eight_point
 from ..starts.five_point import five_point
 from ..starts.general import _vectors as vectors
 
@@ -26,8 +28,9 @@ Poses = tuple[RelativePose, Bool[Array, "..."]]
 
 
 class AbstractHypotheses(eqx.Module):
-    """A way to orient a pair by five of its points; `block` subsets are solved together."""
+    """A way to orient a pair by `size` of its points; `block` subsets are solved together."""
 
+    size: eqx.AbstractClassVar[int]
     block: eqx.AbstractVar[int]
 
     @abc.abstractmethod
@@ -35,32 +38,55 @@ class AbstractHypotheses(eqx.Module):
         """What all subsets of a pair begin with."""
 
     @abc.abstractmethod
-    def __call__(self, five: Pair, begin: RelativePose | None) -> Poses:
-        """The orientations of five points, on the places of a leading axis of fixed length."""
+    def __call__(self, subset: Pair, begin: RelativePose | None) -> Poses:
+        """The orientations of a subset, on the places of a leading axis of fixed length."""
 
 
 class FivePoint(AbstractHypotheses):
     """All real solutions of the five-point problem that have the points in front of both photos: any position."""
 
+    size: ClassVar[int] = 5
     block: int = 4
 
     def begin(self, pair: Pair) -> None:
         return None
 
-    def __call__(self, five: Pair, begin: None) -> Poses:
-        left, right = vectors(five)
+    def __call__(self, subset: Pair, begin: None) -> Poses:
+        left, right = vectors(subset)
         essentials, real = five_point(left, right)
-        poses, front = jax.vmap(lambda e: best_pose(e, left, right, five.mask))(essentials)
-        return poses, real & (front == 5)
+        poses, front = jax.vmap(lambda e: best_pose(e, left, right, subset.mask))(essentials)
+        return poses, real & (front == self.size)
+
+
+class EightPoint(AbstractHypotheses):
+    """The linear solution of eight points and `steps` Gauss-Newton steps on their conditions: any position.
+
+    A twentieth of the work of `FivePoint`, which outweighs that a subset of eight more often holds a wrong point. Where
+    all points lie near a plane it fails.
+    """
+
+    size: ClassVar[int] = 8
+    steps: int = 2
+    block: int = 4
+
+    def begin(self, pair: Pair) -> None:
+        return None
+
+    def __call__(self, subset: Pair, begin: None) -> Poses:
+        left, right = vectors(subset)
+        pose, front = best_pose(eight_point(left, right, jnp.ones_like(subset.x_left)), left, right, subset.mask)
+        pose, fine = refined(subset, pose, self.steps)
+        return jax.tree.map(lambda a: a[None], pose), (fine & (front == self.size))[None]
 
 
 class Newton(AbstractHypotheses):
-    """`steps` of Newton's method on the five conditions, from `start` and in single precision: one orientation.
+    """`steps` of Newton's method on the conditions of five points, from `start`: one orientation.
 
     A fiftieth of the work of `FivePoint`. From the vertical it reaches near-vertical photos; from `General()` photos in
     any position, if the wrong points leave that start within some 20° of the solution.
     """
 
+    size: ClassVar[int] = 5
     start: AbstractStart = Vertical(steps=0)
     steps: int = 4
     block: int = 32
@@ -68,48 +94,54 @@ class Newton(AbstractHypotheses):
     def begin(self, pair: Pair) -> RelativePose:
         return self.start(pair).pose  # pyright: ignore[reportReturnType]
 
-    def __call__(self, five: Pair, begin: RelativePose) -> Poses:
-        single = lambda a: a.astype(jnp.float32)
-        left, right = single(five.focal_left), single(five.focal_right)
-        points = [tuple(single(c[i]) for c in five.coordinates) for i in range(5)]
-        zero, one = jnp.zeros_like(left), jnp.ones_like(left)
-
-        def linearised(pose: RelativePose):
-            """F and its derivatives by the five parameters."""
-            slopes = []
-            for k in range(5):
-                at = lambda x, k=k: pose.moved((zero,) * k + (x,) + (zero,) * (4 - k))
-                f, slope = jax.jvp(lambda x, at=at: coplanarity.fundamental_matrix(at(x), left, right), (zero,), (one,))
-                slopes.append(slope)
-            return [*slopes, f]
-
-        def rows(matrices):
-            """g is linear in F, so that its derivatives are g of those of F."""
-            return [[coplanarity.condition(f, point) for f in matrices] for point in points]
-
-        def normal(rows):
-            return [[sum(row[i] * row[j] for row in rows) for j in range(i + 1)] for i in range(6)]
-
-        def step(_, pose: RelativePose):
-            *n, (*h, _) = stage(normal)(stage(rows)(stage(linearised)(pose)))
-            return pose.moved(tuple(-d for d in solve(n, h)))
-
-        pose = lax.fori_loop(0, self.steps, step, jax.tree.map(single, begin))
-        fine = jnp.isfinite(sum(jax.tree.leaves(pose)))
-        pose = jax.tree.map(lambda a: jnp.where(fine, a, one).astype(five.focal_left.dtype), pose).normalised()
+    def __call__(self, subset: Pair, begin: RelativePose) -> Poses:
+        pose, fine = refined(subset, begin, self.steps)
         return jax.tree.map(lambda a: a[None], pose), fine[None]
 
 
-def draws(seed: int, blocks: int, block: int) -> Float[Array, "block 5 subset"]:
-    """Uniform random numbers, the same for every pair."""
-    return jnp.asarray(np.random.default_rng(seed).random((blocks, 5, block)))
+def refined(subset: Pair, pose: RelativePose, steps: int) -> tuple[RelativePose, Bool[Array, ""]]:
+    """The pose after Gauss-Newton steps on g of a few points, in single precision, and whether it is finite."""
+    single = lambda a: a.astype(jnp.float32)
+    left, right = single(subset.focal_left), single(subset.focal_right)
+    points = [tuple(single(c[i]) for c in subset.coordinates) for i in range(subset.x_left.shape[0])]
+    zero, one = jnp.zeros_like(left), jnp.ones_like(left)
+
+    def linearised(pose: RelativePose):
+        """F and its derivatives by the five parameters."""
+        slopes = []
+        for k in range(5):
+            at = lambda x, k=k: pose.moved((zero,) * k + (x,) + (zero,) * (4 - k))
+            f, slope = jax.jvp(lambda x, at=at: coplanarity.fundamental_matrix(at(x), left, right), (zero,), (one,))
+            slopes.append(slope)
+        return [*slopes, f]
+
+    def rows(matrices):
+        """g is linear in F, so that its derivatives are g of those of F."""
+        return [[coplanarity.condition(f, point) for f in matrices] for point in points]
+
+    def normal(rows):
+        return [[sum(row[i] * row[j] for row in rows) for j in range(i + 1)] for i in range(6)]
+
+    def step(_, pose: RelativePose):
+        *n, (*h, _) = stage(normal)(stage(rows)(stage(linearised)(pose)))
+        return pose.moved(tuple(-d for d in solve(n, h)))
+
+    pose = lax.fori_loop(0, steps, step, jax.tree.map(single, pose))
+    fine = jnp.isfinite(sum(jax.tree.leaves(pose)))
+    return jax.tree.map(lambda a: jnp.where(fine, a, one).astype(subset.focal_left.dtype), pose).normalised(), fine
 
 
-def subsets(uniform: Float[Array, "5 subset"], size: Float[Array, ""]) -> Int[Array, "5 subset"]:
-    """Five different numbers below `size` in ascending order, every choice equally likely."""
+def draws(hypotheses: AbstractHypotheses, count: int, seed: int) -> Float[Array, "block place subset"]:
+    """Uniform random numbers for `count` subsets, the same for every pair."""
+    shape = -(-count // hypotheses.block), hypotheses.size, hypotheses.block
+    return jnp.asarray(np.random.default_rng(seed).random(shape))
+
+
+def subsets(uniform: Float[Array, "place subset"], of: Float[Array, ""]) -> Int[Array, "place subset"]:
+    """Different numbers below `of` in ascending order, as many as there are places, every choice equally likely."""
     taken: list = []
-    for j in range(5):
-        rest = jnp.maximum(size - j, 1.0)
+    for j in range(uniform.shape[0]):
+        rest = jnp.maximum(of - j, 1.0)
         larger = jnp.minimum(jnp.floor(uniform[j] * rest), rest - 1)
         for other in taken:  # the number counts those that are left
             larger = larger + jnp.where(larger >= other, 1.0, 0.0)
@@ -128,14 +160,14 @@ def moved_up(pair: Pair) -> Float[Array, "point 4"]:
     return jnp.zeros_like(rows).at[place].set(rows, mode="drop")
 
 
-def chosen(pair: Pair, points: Float[Array, "point 4"], places: Int[Array, "5 subset"]) -> Pair:
-    """The subsets as pairs of five points, of unit weight."""
-    five = points.at[places.T].get(mode="clip")
-    focal = lambda f: jnp.broadcast_to(f, five.shape[:1])
+def chosen(pair: Pair, points: Float[Array, "point 4"], places: Int[Array, "place subset"]) -> Pair:
+    """The subsets as pairs of a few points, of unit weight."""
+    few = points.at[places.T].get(mode="clip")
+    focal = lambda f: jnp.broadcast_to(f, few.shape[:1])
     return Pair(
-        *(five[:, :, k] for k in range(4)),
-        jnp.ones_like(five[:, :, 0]),
-        jnp.ones(five.shape[:2], bool),
+        *(few[:, :, k] for k in range(4)),
+        jnp.ones_like(few[:, :, 0]),
+        jnp.ones(few.shape[:2], bool),
         focal(pair.focal_left),
         focal(pair.focal_right),
     )
@@ -143,8 +175,8 @@ def chosen(pair: Pair, points: Float[Array, "point 4"], places: Int[Array, "5 su
 
 def solutions(hypotheses: AbstractHypotheses, pair: Pair, points, begin, uniform) -> Poses:
     """The orientations of a block of subsets, one after another on the leading axis."""
-    five = chosen(pair, points, subsets(uniform, count(pair.mask)))
-    found = jax.vmap(lambda five: hypotheses(five, begin))(five)
+    few = chosen(pair, points, subsets(uniform, count(pair.mask)))
+    found = jax.vmap(lambda subset: hypotheses(subset, begin))(few)
     return jax.tree.map(lambda a: a.reshape(-1), found)
 
 

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -12,8 +13,8 @@ from .base import Rejection
 from .hypotheses import AbstractHypotheses, Newton, best, draws, moved_up, solutions, squares
 from .robust import AbstractSearch, Use, Values, at, judged, stepped
 
-BITS = 31
-"""Of a positive number in single precision."""
+BITS = 2 ** np.arange(30, -1, -1, dtype=np.int32)
+"""Of a positive number in single precision, the highest first."""
 
 
 class LeastMedian(AbstractSearch):
@@ -61,9 +62,8 @@ class LeastMedian(AbstractSearch):
             pick = lambda a, b: jnp.where(lowest < old[1], a, b)
             return jax.tree.map(pick, (best(poses, medians), lowest), old), None
 
-        block = self.hypotheses.block
         nothing = vertical(pair.focal_left), jnp.full_like(pair.focal_left, jnp.inf)
-        return lax.scan(searched, nothing, draws(self.seed, -(-self.count // block), block))[0]
+        return lax.scan(searched, nothing, draws(self.hypotheses, self.count, self.seed))[0]
 
 
 def upper_median(values: Values, use: Use) -> Float[Array, ""]:
@@ -75,9 +75,9 @@ def upper_median(values: Values, use: Use) -> Float[Array, ""]:
     ones = use.astype(jnp.float32)
     rank = jnp.floor(total(ones) / 2) + 1
 
-    def halved(k, low):
-        middle = low + lax.shift_left(jnp.int32(1), BITS - 1 - k)
-        return jnp.where(total(jnp.where(bits < middle, ones, 0.0)) < rank, middle, low)
+    def halved(low, bit):
+        middle = low + bit
+        return jnp.where(total(jnp.where(bits < middle, ones, 0.0)) < rank, middle, low), None
 
-    low = lax.fori_loop(jnp.int32(0), jnp.int32(BITS), halved, jnp.int32(0) * bits[0])
+    low, _ = lax.scan(halved, 0 * bits[0], jnp.asarray(BITS))
     return lax.bitcast_convert_type(low, jnp.float32).astype(values.dtype)

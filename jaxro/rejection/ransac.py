@@ -30,10 +30,10 @@ class Found(NamedTuple):
 
 
 class Ransac(AbstractSearch):
-    """Find the pose with the least Σ min((r/sigma)², limit²) among those of random subsets of five points.
+    """Find the pose with the least Σ min((r/sigma)², limit²) among those of random subsets of a few points.
 
     MSAC (Torr and Zisserman 2000), local optimisation (Chum, Matas and Kittler 2003). `limit`: root of the chi-squared
-    value of one degree of freedom at .001. The pose of five points carries their errors, a good point has the variance
+    value of one degree of freedom at .001. The pose of a subset carries their errors, a good point has the variance
     1 + h by it, h about one: subsets are compared with `margin` times the limit. The best of each block takes `steps`
     Gauss-Newton steps on the points within that and one on those within the limit, and is scored. The search ends after
     `count` subsets, or when 1 - (1 - p)^k reaches `confidence`, k the subsets so far, p the share of those without a
@@ -68,7 +68,7 @@ class Ransac(AbstractSearch):
         """The best pose, and what it took."""
         begin, points = self.hypotheses.begin(pair), moved_up(pair)
         block = self.hypotheses.block
-        table = draws(self.seed, -(-self.count // block), block)
+        table = draws(self.hypotheses, self.count, self.seed)
 
         def more(old: Found):
             return (old.blocks < table.shape[0]) & (old.blocks.astype(old.enough.dtype) * block < old.enough)
@@ -98,7 +98,7 @@ class Ransac(AbstractSearch):
 
     def enough(self, agree: Float[Array, ""], of: Float[Array, ""]) -> Float[Array, ""]:
         """How many subsets hold one of agreeing points alone with probability `confidence`."""
-        share = math.prod(jnp.maximum(agree - k, 0.0) / jnp.maximum(of - k, 1.0) for k in range(5))
+        share = math.prod(jnp.maximum(agree - k, 0.0) / jnp.maximum(of - k, 1.0) for k in range(self.hypotheses.size))
         share = jnp.clip(share, CERTAIN, 1 - CERTAIN)
         return math.log1p(-self.confidence) / jnp.log1p(-share)
 

@@ -15,7 +15,7 @@ from ..pairs import Pair, cleaned
 from ..reductions import count, total
 from .base import OUTCOMES, AbstractProcedure, Rejection
 from .graduated_non_convexity import GraduatedNonConvexity
-from .hypotheses import FivePoint, Newton
+from .hypotheses import EightPoint, FivePoint, Newton
 from .ransac import Ransac
 from .robust import AbstractSearch, agreeing, at, in_front, judged, one_by_one, scaled
 
@@ -26,29 +26,34 @@ class Recommended(AbstractProcedure):
     1. Graduated non-convexity from the vertical: no subsets, its work grows with n; right in nearly all near-vertical
        pairs of fifty and more points with half of them wrong.
     2. Random subsets of five points solved by Newton's method from the vertical: for few points, where 1 fails.
-    3. Thirty times as many of them: for few points, half of them wrong.
-    4. Random subsets solved by the five-point method: for photos in any position.
+    3. Random subsets of eight points, solved linearly: for photos in any position.
+    4. Thirty times as many as in 2: for few points of near-vertical photos, half of them wrong.
+    5. Random subsets solved by the five-point method: for what is left, such as plane scenes in any position.
 
     What is found is solved by least squares, and every point, in use or not, judged anew by its normalised residual
     |w| at the familywise `level`, in turns: a good point that a search lost comes back. The same is done point by point
     from all points, by which few and small errors are found best; that set is taken if it convinces, or if its
     Σ r² + limit² (rejected) is the smaller.
 
-    How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) of such sets that agree by
-    accident, p = limit / mean |r| of the rejected points being about the share of wrong points that agree by chance.
-    Above `accidents` of a search the next one follows; above the last of them the outcome is `no_consensus`.
+    How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) (u/(1-u))^(k-5) of such
+    sets that agree by accident: p = limit / mean |r| of the rejected points is about the share of wrong points that
+    agree by chance, u = `wrong` the share of wrong points expected beforehand, without which a dozen points that agree
+    beside three errors of ten sigma would count as an accident. Above `accidents` of a search the next one follows;
+    above the last of them the outcome is `no_consensus`.
     """
 
     sigma: float | None = None
     level: float = 0.001
     rounds: int = 10
+    wrong: float = 1 / 3
     searches: tuple[AbstractSearch, ...] = (
         GraduatedNonConvexity(),
         Ransac(hypotheses=Newton(), count=32, limit=5.0),
+        Ransac(hypotheses=EightPoint(), count=64, limit=5.0),
         Ransac(hypotheses=Newton(), count=1024, limit=5.0),
         Ransac(hypotheses=FivePoint(), limit=5.0),
     )
-    accidents: tuple[float, ...] = (1e-6, 1e-6, 0.05, 0.05)
+    accidents: tuple[float, ...] = (1e-4, 1e-3, 1e-3, 0.05, 0.05)
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
@@ -84,10 +89,11 @@ class Recommended(AbstractProcedure):
         pose = search.search(pair)
         use = pair.mask & (at(pair, pose).squares <= limit**2)
         found = agreeing(pair, pose, use, limit, self.rounds)
-        best, lowest = one_by_one(pair, *found, limit, 2)
+        best, lowest, _ = one_by_one(pair, *found, limit, 2)
         # small errors do not stand out in a search: the points one by one, beginning with all of them
-        other, cost = one_by_one(pair, pose, pair.mask, limit, self.rounds)
-        first = (cost < lowest) | (self._accidents(pair, *other, limit) <= math.log(self.accidents[0]))
+        other, cost, rests = one_by_one(pair, pose, pair.mask, limit, self.rounds)
+        convinces = self._accidents(pair, *other, limit) <= math.log(self.accidents[0])
+        first = rests & ((cost < lowest) | convinces)
         return jax.tree.map(lambda a, b: jnp.where(first, a, b), other, best)
 
     def _elsewhere(self, search, pair: Pair, limit, pose: RelativePose, use, expected, needed):
@@ -112,4 +118,5 @@ class Recommended(AbstractProcedure):
         mean = total(jnp.where(wrong, jnp.sqrt(linear.squares), 0.0)) / jnp.maximum(count(wrong), 1.0)
         chance = limit / jnp.maximum(mean, 2 * limit)
         choices = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
-        return jnp.where(k > 5, choices + (k - 5) * jnp.log(chance), jnp.inf)
+        odds = math.log(self.wrong / (1 - self.wrong))
+        return jnp.where(k > 5, choices + (k - 5) * (jnp.log(chance) + odds), jnp.inf)

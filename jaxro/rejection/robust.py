@@ -135,7 +135,8 @@ def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds:
 
 
 def one_by_one(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int):
-    """(pose, points) near the least Σ (r/sigma)² over the points in use + limit² (points rejected), and that sum.
+    """(pose, points) near the least Σ (r/sigma)² over the points in use + limit² (points rejected), that sum, and
+    whether it rests there.
 
     In each round the one point changes sides that lowers the sum most: out, by w² - limit², or in, by limit² - w².
     """
@@ -146,15 +147,15 @@ def one_by_one(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, round
         return stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
 
     def turn(_, state):
-        pose, use = state
+        pose, use, _ = state
         pose = solved(pose, use)
         gain = normalised(at(pair, pose), use) ** 2 - cut
         gain = jnp.where(pair.mask, jnp.where(use, gain, -gain), 0.0)
         best = jnp.max(gain)
-        return pose, use ^ ((gain == best) & (best > 0))
+        return pose, use ^ ((gain == best) & (best > 0)), best <= 0
 
-    pose, use = jax.lax.fori_loop(0, rounds, turn, (pose, use))
+    pose, use, rests = jax.lax.fori_loop(0, rounds, turn, (pose, use, count(use) < 0))
     pose = solved(pose, use)
     squares = at(pair, pose).squares
     cost = jnp.sum(jnp.where(pair.mask, jnp.where(use, squares, cut), 0.0))
-    return (pose, use), jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+    return (pose, use), jnp.where(jnp.isfinite(cost), cost, jnp.inf), rests

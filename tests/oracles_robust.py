@@ -1,0 +1,90 @@
+"""The modern procedures in plain NumPy: dense matrices, one pair at a time, dependent elements of unit base.
+
+Points are columns of (4, point) coordinates; `share` is the part of its weight that a point has in the solution.
+"""
+
+from itertools import combinations
+
+import numpy as np
+import oracles
+import scipy.stats
+
+PLACED = oracles.dependent(1.0)
+
+
+def linearised(points, focal, sigma, elements):
+    """The whitened condition r = g / (sigma |dg/dl|) and its columns, the denominator held."""
+    g = lambda e: oracles.condition(PLACED, e, points, (focal, focal))
+    slopes = []
+    for k in range(4):
+        moved = points.astype(complex)
+        moved[k] += 1j * oracles.STEP
+        slopes.append(oracles.condition(PLACED, elements, moved, (focal, focal)).imag / oracles.STEP)
+    spread = sigma * np.sqrt(np.sum(np.square(slopes), axis=0))
+    return g(elements) / spread, oracles.jacobian(g, elements) / spread[:, None]
+
+
+def solved(points, focal, sigma, share, elements, iterations=30):
+    """Gauss-Newton with these shares of the weights."""
+    for _ in range(iterations):
+        r, a = linearised(points, focal, sigma, elements)
+        step = np.linalg.solve((a.T * share) @ a, a.T @ (share * r))
+        elements = elements - step
+        if np.max(np.abs(step)) < 1e-12:
+            break
+    return elements
+
+
+def standardised(points, focal, sigma, share, elements):
+    """|r| over its standard deviation sqrt(1 + (1 - 2p) h), h = a N⁻¹ a'."""
+    r, a = linearised(points, focal, sigma, elements)
+    h = np.sum((a @ np.linalg.inv((a.T * share) @ a)) * a, axis=1)
+    return np.abs(r) / np.sqrt(1 + (1 - 2 * share) * h), h
+
+
+def reweighted(points, focal, sigma, weight, limit, rounds=200):
+    """The points with |w| <= limit at the fixed point of w -> weight(w) next to least squares."""
+    share = np.ones(points.shape[1])
+    elements = solved(points, focal, sigma, share, np.zeros(5))
+    for _ in range(rounds):
+        share = weight(standardised(points, focal, sigma, share, elements)[0])
+        before, elements = elements, solved(points, focal, sigma, share, elements, 1)
+        if np.max(np.abs(elements - before)) < 1e-9:
+            break
+    return standardised(points, focal, sigma, share, elements)[0] <= limit
+
+
+def snooping(points, focal, sigma, level, estimated=False, least=6):
+    """The points in the order in which the largest |w| (or tau, with sigma0) goes while it exceeds its quantile."""
+    used, gone = list(range(points.shape[1])), []
+    while len(used) > least:
+        here, every = points[:, used], np.ones(len(used))
+        elements = solved(here, focal, sigma, every, np.zeros(5))
+        w, h = standardised(here, focal, sigma, every, elements)
+        f = len(used) - 5
+        limit = scipy.stats.norm.isf(level / 2)
+        if estimated:
+            w = w / np.sqrt(np.sum(linearised(here, focal, sigma, elements)[0] ** 2) / f)
+            t = scipy.stats.t.isf(level / 2, max(f - 1, 1))
+            limit = np.sqrt(f) * t / np.sqrt(f - 1 + t * t) if f > 1 else np.inf
+        w[1 - h < 1e-6] = 0
+        if np.max(w) <= limit:
+            break
+        gone.append(used.pop(int(np.argmax(w))))
+    return gone
+
+
+def fewest_omissions(points, focal, sigma, most, level):
+    """The omissions, fewest first, whose Σ r² passes the chi-squared test and is the least of its number; every one
+    solved."""
+    n = points.shape[1]
+    for k in range(most + 1):
+        left = {}
+        for omitted in combinations(range(n), k):
+            here = np.delete(points, omitted, axis=1)
+            elements = solved(here, focal, sigma, np.ones(n - k), np.zeros(5))
+            left[omitted] = np.sum(linearised(here, focal, sigma, elements)[0] ** 2)
+        best = min(left, key=left.__getitem__)
+        if left[best] <= scipy.stats.chi2.isf(level, n - k - 5):
+            return best
+    return None
