@@ -15,6 +15,7 @@ from . import (
     critical_values as critical_values,
     losses as losses,
     rejection as rejection,
+    reliability as reliability,
     rotations as rotations,
     simulation as simulation,
     starts as starts,
@@ -42,6 +43,7 @@ from .pairs import (
     swapped as swapped,
     unstack as unstack,
 )
+from .reliability import Reliability as Reliability, assess as assess
 from .results import RESULTS as RESULTS, is_usable as is_usable
 
 __version__ = "0.1.0"
