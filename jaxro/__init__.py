@@ -19,6 +19,7 @@ from . import (
     rotations as rotations,
     simulation as simulation,
     starts as starts,
+    variance_components as variance_components,
 )
 from .adjustment import Adjustment as Adjustment, adjust as adjust
 from .batch import clean_batch as clean_batch, orient_batch as orient_batch

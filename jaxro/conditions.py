@@ -23,6 +23,11 @@ class Linear(NamedTuple):
     gradient: Coordinates
     weight: Values
 
+    def corrections(self, pair: Pair) -> Coordinates:
+        """v = -Q Bᵀ g / d of the coordinates, which bring the rays to intersection."""
+        factor = -self.g * self.weight * pair.sigma**2
+        return tuple(factor * b for b in self.gradient)
+
 
 def linearised(pair: Pair, pose: RelativePose) -> Linear:
     """The rigorous conditions of one pair at a pose, with its sigma; the pair is `cleaned`."""

@@ -55,7 +55,7 @@ def chi_squared(level: ArrayLike, freedom: ArrayLike) -> Scalar:
 
 
 def chi_squared_bounds(level: ArrayLike, freedom: ArrayLike) -> tuple[Scalar, Scalar]:
-    """Two-sided: a sum of `freedom` squared normal numbers lies below or above these with probability `level` / 2 each."""
+    """Two-sided: a sum of `freedom` squared normal numbers lies below, or above, these with probability `level` / 2."""
     half, freedom = jnp.asarray(level, float) / 2, jnp.asarray(freedom, float)
     low = _where(lambda x: gammainc(freedom / 2, x / 2) < half, jnp.zeros_like(half) + freedom, increasing=False)
     return low, chi_squared(half, freedom)
@@ -90,7 +90,7 @@ def sidak(level: ArrayLike, count: ArrayLike) -> Scalar:
 def delta_normal(level: ArrayLike, power: ArrayLike) -> Scalar:
     """The error that the two-sided normal test finds with probability `power`, in standard deviations (Baarda 1968):
 
-        P(|z + delta| > k) = power,    nearly k + ndtri(power), from which it differs by the far tail.
+    P(|z + delta| > k) = power,    nearly k + ndtri(power), from which it differs by the far tail.
     """
     limit, power = normal(level), jnp.asarray(power, float)
     missed = lambda x: ndtr(x - limit) + ndtr(-x - limit) < power

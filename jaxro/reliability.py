@@ -1,4 +1,4 @@
-"""What a finished orientation can tell of errors in its measurements: which would be seen, and what hidden ones would do.
+"""What a finished orientation can tell of errors in its measurements: which would be seen, what hidden ones would do.
 
 Of the Gauss-Helmert model A x + B v + g = 0 with one condition per point, D = B Q Bᵀ its variance for sigma0 = 1,
 h = a N⁻¹ aᵀ / D its leverage (Baarda 1968; Pope 1976; Förstner 1979, 1987; Caspary 1988):
@@ -17,6 +17,7 @@ detectable the same effect on the elements. All is of first order, at the measur
 """
 
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,13 +26,14 @@ import numpy as np
 from jax.scipy.special import betainc, gammainc, gammaincc, ndtr
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from . import coplanarity, critical_values as critical, rotations as rot
-from .conditions import linearised
-from .elements import DependentElements, IndependentElements, RelativePose, convert
+from . import critical_values as critical
+from .conditions import Linear, linearised
+from .external_reliability import effects, root
 from .normal_equations import accumulate, cholesky, substitute
 from .orientation import Orientation
 from .pairs import Coordinates, Pair, cleaned
-from .reductions import count, sums, total
+from .programs import stage
+from .reductions import count
 
 PerPoint = Float[Array, "*pairs point"]
 PerPair = Float[Array, "*pairs"]
@@ -58,8 +60,8 @@ class Reliability(eqx.Module):
     Per pair: the `largest` effects on the elements, on m_q, and of `external`; `correlation` of the elements;
     `significance`, element over standard deviation (0 for `RelativePose`, whose local parameters have no values).
 
-    `sigma0` is the a-priori standard deviation of unit weight where it is `known`, else the estimated one, and w is then
-    tau. `limit`: what |w| exceeds with probability `level` when a point has no error.
+    `sigma0` is the a-priori standard deviation of unit weight where it is `known`, else the estimated one, and w is
+    then tau. `limit`: what |w| exceeds with probability `level` when a point has no error.
     """
 
     redundancy: PerPoint
@@ -69,7 +71,7 @@ class Reliability(eqx.Module):
     testable: Bool[Array, "*pairs point"]
     coordinate_redundancy: Coordinates
     detectable: Coordinates
-    effect: Float[Array, "*pairs 5 point"]
+    effect: tuple[PerPoint, ...]
     effect_m_q: PerPoint
     effect_height: Coordinates
     external: PerPoint
@@ -168,47 +170,37 @@ def assess(
     pair, _ = cleaned(pair)
     use = pair.mask & orientation.usable
     linear = linearised(pair, orientation.pose)
-    n, _, squares = accumulate([linear.g], [[c] for c in linear.columns], [linear.weight])
-    z = substitute(cholesky(n)[0], linear.columns)
-    h = linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True))
+    z, h, squares = stage(_solved)(linear)
     r = jnp.where(use, 1 - h, 0.0)
     points = count(use)
     freedom = jnp.where(points > 5, points - 5, 0.0)
-    estimated = _root(squares / jnp.where(freedom > 0, freedom, 1.0), freedom > 0)
+    estimated = root(squares / jnp.where(freedom > 0, freedom, 1.0), freedom > 0)
     known = sigma0 is not None
     unit = jnp.broadcast_to(jnp.asarray(sigma0, r.dtype), estimated.shape) if known else estimated
     testable = use & (r > UNTESTABLE) & (freedom > (0 if known else 1)) & (unit > 0)
 
     safe = jnp.where(testable, r, 1.0)
     spread = jnp.where(testable, jnp.sqrt(safe / jnp.where(testable, linear.weight, 1.0)), 1.0)  # sqrt(r D)
-    standard = lambda scale: jnp.where(testable & (scale > 0), linear.g * linear.weight * spread / safe, 0.0) / jnp.where(
-        scale > 0, scale, 1.0
+    standard = lambda scale: (
+        jnp.where(testable & (scale > 0), linear.g * linear.weight * spread / safe, 0.0)
+        / jnp.where(scale > 0, scale, 1.0)
     )
     tau = standard(estimated)
     rest = freedom - tau**2
     outer = testable & (freedom > 1)
     t = jnp.where(outer, tau * jnp.sqrt(jnp.where(outer, freedom - 1, 1.0) / jnp.where(rest > 1e-12, rest, 1e-12)), 0.0)
 
-    delta, limit, level_of_one = (
-        critical.by_count(lambda _, column=column: column, pair.mask.shape[0], points)
-        for column in _tests(pair.mask.shape[0], known, level, power, familywise)
-    )
-    jump = jnp.where(testable, delta * unit * spread / safe, 0.0)  # of g: delta sigma0 sqrt(D / r)
+    tests = _tests(pair.mask.shape[0], known, level, power, familywise)
+    delta, limit, each = (critical.by_count(lambda _, t=t: t, pair.mask.shape[0], points) for t in tests)
+    # of g: delta sigma0 sqrt(D / r), and what it does to the local parameters of the pose
+    jump, shift = stage(_moved)(z, linear.weight, jnp.where(testable, delta * unit * spread / safe, 0.0))
     parts = tuple(b**2 * pair.sigma**2 * linear.weight * r for b in linear.gradient)
     seen = tuple(testable & (part > UNTESTABLE) for part in parts)
-    per_jump = [jnp.where(s, 1 / jnp.where(s, b, 1.0), 0.0) for s, b in zip(seen, linear.gradient, strict=True)]
     hidden = lambda value, seen: jnp.where(use, jnp.where(seen, value, jnp.inf), 0.0)
 
-    shift = [-entry * linear.weight * jump for entry in z]
-    slopes, by_coordinate, by_parameter = _readings(pair, orientation)
-    effect = [sum(a * b for a, b in zip(row, shift, strict=True)) for row in slopes]
-    effect = jnp.stack([hidden(jnp.abs(e), testable) for e in effect])
-    moved = sum(a * b for a, b in zip(by_parameter, shift, strict=True))
-    height = tuple(
-        hidden(jnp.abs(z_l * inverse * jump + moved), s)
-        for z_l, inverse, s in zip(by_coordinate, per_jump, seen, strict=True)
-    )
-    effect_m_q = hidden(_effect_on_m_q(pair, orientation.pose, linear, shift, jump, freedom), testable)
+    done = effects(pair, orientation, linear, shift, jump, r)
+    effect = tuple(hidden(e, testable) for e in done.elements)
+    effect_m_q = hidden(done.m_q, testable)
     external = hidden(delta * jnp.sqrt(jnp.where(testable, h, 0.0) / safe), testable)
     most = lambda value: jnp.where(orientation.usable, jnp.max(value, axis=-1), jnp.inf)
 
@@ -223,12 +215,12 @@ def assess(
         t,
         testable,
         parts,
-        tuple(hidden(jnp.abs(jump * inverse), s) for inverse, s in zip(per_jump, seen, strict=True)),
+        tuple(hidden(jump / jnp.where(s, jnp.abs(b), 1.0), s) for b, s in zip(linear.gradient, seen, strict=True)),
         effect,
         effect_m_q,
-        height,
+        tuple(hidden(z, s) for z, s in zip(done.height, seen, strict=True)),
         external,
-        most(effect),
+        jnp.stack([most(e) for e in effect]),
         most(effect_m_q),
         most(external),
         orientation.cofactor / (deviations[:, None] * deviations[None, :]),
@@ -236,15 +228,27 @@ def assess(
         unit,
         estimated,
         freedom.astype(int),
-        level_of_one,
+        each,
         limit,
         known,
         power,
     )
 
 
+def _solved(linear: Linear):
+    """N⁻¹ aᵀ and leverage of every point, and Σ g² / d."""
+    n, _, squares = accumulate([linear.g], [[c] for c in linear.columns], [linear.weight])
+    z = substitute(cholesky(n)[0], linear.columns)
+    return z, linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True)), squares
+
+
+def _moved(z: list[Array], weight: Array, jump: Array):
+    """The jumps, and the shifts of the local parameters by them."""
+    return jump, [-entry * weight * jump for entry in z]
+
+
 @lru_cache(maxsize=64)
-def _tests(most: int, known: bool, level: float, power: float, familywise: bool) -> tuple[np.ndarray, ...]:
+def _tests(most: int, known: bool, level: float, power: float, familywise: bool) -> tuple[Any, ...]:
     """delta0, limit of |w| and level of the test of a point, for pairs of 0 to `most` points."""
     with jax.ensure_compile_time_eval():
         n = jnp.arange(most + 1.0)
@@ -255,82 +259,3 @@ def _tests(most: int, known: bool, level: float, power: float, familywise: bool)
             freedom = jnp.maximum(n - 5, 2.0)
             delta, limit = critical.delta_student(alone, power, freedom - 1), critical.tau(alone, freedom)
         return np.asarray(delta), np.asarray(limit), np.asarray(alone)
-
-
-def _root(square: Array, there: Array) -> Array:
-    """The root, zero where the square is zero or not there, with finite derivatives."""
-    positive = there & (square > 0)
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
-
-
-def _readings(pair: Pair, orientation: Orientation):
-    """Derivatives of the elements by the five local parameters of the pose (5 rows of 5 numbers), and of the model height
-    of every point by its coordinates (4 arrays) and by these parameters (5 arrays)."""
-    pose, elements = orientation.pose, orientation.elements
-    system = type(elements)
-    length = elements.bx if isinstance(elements, DependentElements) else jnp.ones_like(pose.bx)
-
-    def shared(*x):
-        moved = pose.moved(x)
-        chosen = convert(moved, system, length)
-        values = x if system is RelativePose else chosen.values()
-        frame = chosen.model_frame()
-        rotation, base = moved.relative()
-        scale = length / moved.bx if system is DependentElements else length
-        right, base = rot.product(frame, rotation), rot.scaled(rot.apply(frame, base), scale)
-        return values, (frame, right, base, coplanarity.fundamental_matrix(moved, pair.focal_left, pair.focal_right))
-
-    origin = (jnp.zeros_like(pose.bx),) * 5
-    unit = [tuple(jnp.ones_like(o) if i == k else o for i, o in enumerate(origin)) for k in range(5)]
-    (_, placed), push = jax.linearize(shared, *origin)
-    slopes = [push(*direction) for direction in unit]
-
-    def height(placed, point):
-        frame, right, base, f = placed
-        corrected = tuple(
-            c + v for c, v in zip(point, coplanarity.corrections(f, point, jnp.asarray(True)), strict=True)
-        )
-        return coplanarity.intersection(frame, right, base, corrected, pair.focal_left, pair.focal_right)[0][2]
-
-    def one(point):
-        z, pull = jax.vjp(height, placed, point)
-        return z, *pull(jnp.ones_like(z))
-
-    # masked points stand where no rays are parallel, so that no derivative divides by zero
-    x_left = jnp.where(pair.mask, pair.x_left, pair.focal_left)
-    z, by_placed, by_coordinate = jax.vmap(one)((x_left, *pair.coordinates[1:]))
-    if system is IndependentElements:  # the length of the base is in the model, not in the elements
-        z = jnp.where(pair.mask, z, 0.0)
-        product, square = sums((z * orientation.model[2], z * z))
-        length = product / jnp.where(square > 0, square, 1.0)
-        by_coordinate, by_placed = jax.tree.map(lambda a: a * length, (by_coordinate, by_placed))
-    leaves = jax.tree.leaves(by_placed)
-    by_parameter = [
-        sum(a * s for a, s in zip(leaves, jax.tree.leaves(slope), strict=True)) for _, slope in slopes
-    ]
-    rows = [[values[i] for values, _ in slopes] for i in range(5)]
-    return rows, by_coordinate, by_parameter
-
-
-def _effect_on_m_q(pair: Pair, pose: RelativePose, linear, shift: list[Array], jump: Array, freedom: Array) -> Array:
-    """How much m_q = sqrt([qq] / (n - 5)) grows with the detectable error of a point, of the worse sign.
-
-    With q = c g every parallax changes by c (a · shift), that of the point itself by c jump more.
-    """
-    left, right = (frame[2] for frame in coplanarity.turned(pose))
-
-    def ratio(point):
-        """q / g = -f / (Z1 Z2) of the photos turned parallel to the base."""
-        x1, y1, x2, y2 = point
-        first, second = (x1, y1, -pair.focal_left), (x2, y2, -pair.focal_right)
-        return -pair.focal_left / (rot.dot(left, first) * rot.dot(right, second))
-
-    c = jnp.where(pair.mask, jax.vmap(ratio)(pair.coordinates), 0.0)
-    own = c**2
-    n, s, qq = accumulate([linear.g], [[column] for column in linear.columns], [own])
-    along = sum(a * b for a, b in zip(linear.columns, shift, strict=True))
-    both = sum((1.0 if i == j else 2.0) * n[i][j] * shift[i] * shift[j] for i in range(5) for j in range(i + 1))
-    square = both + own * jump * (2 * along + jump)
-    cross = sum(a * b for a, b in zip(s, shift, strict=True)) + own * linear.g * jump
-    f = jnp.where(freedom > 0, freedom, 1.0)
-    return _root((qq + 2 * jnp.abs(cross) + square) / f, jump > 0) - _root(qq / f, jump > 0)

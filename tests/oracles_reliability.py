@@ -52,9 +52,7 @@ def externally_studentised(coordinates, focal, placed, elements, sigma, point) -
     focal = (focal, focal) if np.ndim(focal) == 0 else focal
     a = oracles.jacobian(lambda e: oracles.condition(placed, e, coordinates, focal), elements)
     g = oracles.condition(placed, elements, coordinates, focal)
-    b = oracles.jacobian(
-        lambda l: oracles.condition(placed, elements, l.reshape(n, 4).T, focal), coordinates.T.ravel()
-    )
+    b = oracles.jacobian(lambda l: oracles.condition(placed, elements, l.reshape(n, 4).T, focal), coordinates.T.ravel())
     d = np.sum(b**2, axis=1) * np.broadcast_to(sigma, n) ** 2
     a = np.column_stack([a, np.eye(n)[point]]) / np.sqrt(d)[:, None]
     g = g / np.sqrt(d)
