@@ -4,7 +4,7 @@ All of first order. An error that changes the condition g of its point by `jump`
 by -N⁻¹ aᵀ jump / d, whichever of the four coordinates it is in; a model height also follows the coordinate itself.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -60,8 +60,9 @@ def _of_parameters(orientation: Orientation):
     derivatives of that by the same parameters.
     """
     system = type(orientation.elements)
-    dependent = isinstance(orientation.elements, DependentElements)
-    length = orientation.elements.bx if dependent else jnp.ones_like(orientation.pose.bx)
+    elements = orientation.elements
+    dependent = isinstance(elements, DependentElements)
+    length = elements.bx if isinstance(elements, DependentElements) else jnp.ones_like(orientation.pose.bx)
 
     def linearly(pose: RelativePose, length):
         def shared(*x):
@@ -114,7 +115,7 @@ def _heights(pair: Pair, linear: Linear, placed: tuple, slopes: list[tuple], shi
     return z, moved - dot(by_coordinate, linear.gradient) * left, by_coordinate
 
 
-def dot(a, b):
+def dot(a, b) -> Any:
     """The sum of the products of equally many entries."""
     return sum(x * y for x, y in zip(a, b, strict=True))
 
@@ -139,5 +140,5 @@ def _on_m_q(pair: Pair, orientation: Orientation, linear: Linear, shift: list[Va
     ) + own * jump * (2 * dot(linear.columns, shift) + jump)
     cross = dot(s, shift) + own * linear.g * jump
     freedom = orientation.degrees_of_freedom
-    f = jnp.where(freedom > 0, freedom, 1).astype(qq.dtype)
+    f = jnp.where(freedom > 0, freedom, 1).astype(own.dtype)
     return root((qq + 2 * jnp.abs(cross) + square) / f) - root(qq / f)

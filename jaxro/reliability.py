@@ -32,7 +32,7 @@ from .external_reliability import effects, root
 from .normal_equations import accumulate, cholesky, substitute
 from .orientation import Orientation
 from .pairs import Coordinates, Pair, cleaned
-from .programs import stage
+from .programs import QUICK, Program, stage, traced
 from .reductions import count
 
 PerPoint = Float[Array, "*pairs point"]
@@ -167,7 +167,17 @@ def assess(
     `level` of the test of each point, or (`familywise`) of all together by Šidák; `power` with which detectable errors
     are found. Works under jit and vmap. A pair whose orientation is not usable has nothing testable.
     """
-    pair, _ = cleaned(pair)
+    if pair.x_left.ndim != 1:
+        raise ValueError(f"assess takes one pair, but the coordinates have shape {pair.x_left.shape}: use jax.vmap")
+    sigma0 = None if sigma0 is None else jnp.asarray(sigma0, pair.x_left.dtype)
+    options = {"sigma0": sigma0, "level": level, "power": power, "familywise": familywise}
+    if traced((pair, orientation, sigma0)):
+        return _assess((pair, orientation), **options)
+    return Program(_assess, options, QUICK)((pair, orientation))
+
+
+def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: float, power: float, familywise: bool):
+    pair, orientation = cleaned(read[0])[0], read[1]
     use = pair.mask & orientation.usable
     linear = linearised(pair, orientation.pose)
     z, h, squares = stage(_solved)(linear)
@@ -176,7 +186,7 @@ def assess(
     freedom = jnp.where(points > 5, points - 5, 0.0)
     estimated = root(squares / jnp.where(freedom > 0, freedom, 1.0), freedom > 0)
     known = sigma0 is not None
-    unit = jnp.broadcast_to(jnp.asarray(sigma0, r.dtype), estimated.shape) if known else estimated
+    unit = estimated if sigma0 is None else sigma0
     testable = use & (r > UNTESTABLE) & (freedom > (0 if known else 1)) & (unit > 0)
 
     safe = jnp.where(testable, r, 1.0)

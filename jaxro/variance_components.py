@@ -23,6 +23,7 @@ from . import normal_equations as normal
 from .conditions import Linear, linearised
 from .orientation import Orientation
 from .pairs import Pair, cleaned
+from .programs import Program, traced
 from .reductions import sums, total
 
 SURE = 0.5
@@ -73,13 +74,21 @@ def estimate(pairs: Pair, orientations: Orientation, groups: Sequence[ArrayLike]
         names = sorted({int(v) for g in labels for v in jnp.unique(g)})
     if names != list(range(len(names))):
         raise ValueError(f"variance_components: groups must be numbered 0, 1, 2, ... without gaps, got {names}")
-    size = len(names)
-    labels = [jnp.broadcast_to(g if g.ndim != 1 else g[None, :], shape) for g in labels]
+    labels = tuple(labels)
+    if traced((pairs, orientations)):
+        return _estimate((pairs, orientations), labels=labels, size=len(names), steps=steps)
+    return Program(_estimate, {"labels": labels, "size": len(names), "steps": steps})((pairs, orientations))
+
+
+def _estimate(data: tuple[Pair, Orientation], *, labels: tuple[Array, ...], size: int, steps: int) -> Components:
+    pairs, orientations = data
+    shape = pairs.x_left.shape
+    parted = [jnp.broadcast_to(g if g.ndim != 1 else g[None, :], shape) for g in labels]
     pairs = jax.vmap(lambda p: cleaned(p)[0])(pairs)
     pairs = pairs.with_mask(pairs.mask & orientations.usable[:, None])
     linear = jax.vmap(linearised)(pairs, orientations.pose)
     parts = [
-        sum(jnp.where(g == k, b**2, 0.0) for g, b in zip(labels, linear.gradient, strict=True)) * pairs.sigma**2
+        sum(jnp.where(g == k, b**2, 0.0) for g, b in zip(parted, linear.gradient, strict=True)) * pairs.sigma**2
         for k in range(size)
     ]
     freedom = total(jnp.maximum(total(pairs.mask.astype(pairs.sigma.dtype)) - 5, 0.0))
@@ -129,7 +138,8 @@ def _of_pair(theta: Array, linear: Linear, parts: list[Array], mask: Array) -> t
 
     tr(P S_k P S_l) = Σ s_k s_l (1 - 2 h) / d² + tr(N⁻¹ M_k N⁻¹ M_l),    M_k = Σ s_k a aᵀ / d²
     """
-    d = sum(t * s for t, s in zip(theta, parts, strict=True))
+    terms = [theta[k] * s for k, s in enumerate(parts)]
+    d = sum(terms[1:], terms[0])
     weight = jnp.where(mask, 1 / jnp.where(mask, d, 1.0), 0.0)
     columns = [[c] for c in linear.columns]
     n, right, _ = normal.accumulate([linear.g], columns, [weight])
