@@ -36,11 +36,12 @@ FLOOR = 1e-6
 class Components(eqx.Module):
     """Standard deviations of K groups, factors to the sigma of the pairs (mm or px where that is 1).
 
-    `estimable`: whether the pairs determine the group. Where not, its variance was held at that of all measurements
-    together (`pooled` is its root), `sigma` is 0 and the errors are infinite. In near-vertical pairs x is not
-    estimable, and y of the left and right photo only together: give them one group. `covariance`: of the variances
-    sigma²; rows of what is not estimable are 0. A sigma of 0 that is estimable came out negative: the errors of this
-    group are too small to be seen beside the others, and `variance_error` says how small.
+    `estimable`: whether the pairs determine the group. Where not, its variance was held near that of all measurements
+    together (`pooled` is its root), as if known to half of it; `sigma` is 0 and the errors are infinite. In
+    near-vertical pairs that is so for x, and for y of the left and right photo unless tilts tell them apart: give them
+    one group. `covariance`: of the variances sigma²; rows of what is not estimable are 0. A sigma of 0 that is
+    estimable came out negative: the errors of this group are too small to be seen beside the others, and
+    `variance_error` says how small.
     `redundancy`: the part of each group in the degrees of freedom.
     """
 
@@ -100,22 +101,21 @@ def _estimate(data: tuple[Pair, Orientation], *, labels: tuple[Array, ...], size
     one = jnp.ones(size, pairs.sigma.dtype)
     f, q = _unpacked(equations(one), size)
     pooled = jnp.sum(q) / jnp.where(there, freedom, 1.0)
-    estimable = there & (_errors(f, jnp.ones(size, bool)) < SURE)
+    safe = jnp.where(pooled > 0, pooled, 1.0)
+    estimable = there & (_errors(f) < SURE)
+    prior = jnp.diag(jnp.where(estimable, 0.0, 2 / (SURE * safe) ** 2))
 
     def scored(_, state):
         theta, _ = state
         f, q = _unpacked(equations(theta), size)
-        held = jnp.where(estimable, 0.0, pooled)
-        right = q - jnp.sum(f * held[None, :], axis=1)
-        new = _solved(f, right, estimable)
-        new = jnp.where(estimable, jnp.where(new > FLOOR * pooled, new, FLOOR * pooled), pooled)
-        change = jnp.max(jnp.abs(new - theta)) / jnp.where(pooled > 0, pooled, 1.0)
-        return new, change
+        right = q - jnp.sum(f * pooled, axis=1)
+        new = pooled + jnp.stack(normal.solve(_lower(f + prior), list(right)))
+        new = jnp.where(new > FLOOR * pooled, new, FLOOR * pooled)
+        return new, jnp.max(jnp.where(estimable, jnp.abs(new - theta), 0.0)) / safe
 
-    start = one * pooled
-    theta, change = jax.lax.fori_loop(0, steps, scored, (start, pooled))
+    theta, change = jax.lax.fori_loop(0, steps, scored, (one * pooled, pooled))
     f, _ = _unpacked(equations(theta), size)
-    error = _errors(f, estimable)
+    error = _errors(f + prior)
     estimable = estimable & (error < SURE * pooled)
     positive = estimable & (theta > FLOOR * pooled)
     sigma = jnp.where(positive, jnp.sqrt(theta), 0.0)
@@ -124,7 +124,7 @@ def _estimate(data: tuple[Pair, Orientation], *, labels: tuple[Array, ...], size
         sigma,
         jnp.where(positive, error / jnp.where(positive, 2 * sigma, 1.0), jnp.inf),
         jnp.where(estimable, error, jnp.inf),
-        jnp.where(both, 2 * _inverse(f, estimable), 0.0),
+        jnp.where(both, 2 * _inverse(f + prior), 0.0),
         estimable,
         jnp.sqrt(pooled),
         theta * jnp.sum(f * theta[None, :], axis=1),
@@ -174,26 +174,15 @@ def _unpacked(entries: list[Array], size: int) -> tuple[Array, Array]:
     return normal.dense(lower), jnp.stack(rest)
 
 
-def _kept(f: Array, use: Array) -> Array:
-    """F with the unit matrix in place of what is not used."""
-    unit = jnp.eye(f.shape[0], dtype=f.dtype)
-    return jnp.where(use[:, None] & use[None, :], f, unit * jnp.where(use, 0.0, 1.0)[None, :])
-
-
 def _lower(f: Array) -> list[list[Array]]:
     return [[f[i, j] for j in range(i + 1)] for i in range(f.shape[0])]
 
 
-def _solved(f: Array, right: Array, use: Array) -> Array:
-    return jnp.stack(normal.solve(_lower(_kept(f, use)), list(jnp.where(use, right, 0.0))))
+def _inverse(f: Array) -> Array:
+    return normal.dense(normal.inverse(_lower(f))[0])
 
 
-def _inverse(f: Array, use: Array) -> Array:
-    return normal.dense(normal.inverse(_lower(_kept(f, use)))[0])
-
-
-def _errors(f: Array, use: Array) -> Array:
-    """Standard errors of the variances, infinite where F does not determine them."""
-    # the lifted inverse of a singular F is wrong, but large
-    variance = jnp.diagonal(2 * _inverse(f, use))
-    return jnp.where((variance > 0) & use, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), jnp.inf)
+def _errors(f: Array) -> Array:
+    """Standard errors of the variances; the lifted inverse of a singular F is wrong, but large."""
+    variance = jnp.diagonal(2 * _inverse(f))
+    return jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), jnp.inf)

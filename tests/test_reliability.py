@@ -147,9 +147,10 @@ def test_external_reliability_is_readjustment(system, elements):
         np.testing.assert_allclose(reading.effect_m_q[point], (plus[2] + minus[2]) / 2 / part, rtol=2e-3)
 
 
-def test_effect_on_m_q_with_errors_present():
+@pytest.mark.parametrize("elements", [NEAR, CONVERGENT], ids=["near vertical", "convergent"])
+def test_effect_on_m_q_with_errors_present(elements):
     """The larger m_q of both signs, against adjustment of the pair with the planted error."""
-    one = measured(sigma=0.01)
+    one = measured(elements=elements, sigma=0.01)
     found, reading = read(one, sigma0=0.01)
     for point in (0, 7):
         error = np.zeros(16)

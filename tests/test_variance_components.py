@@ -105,6 +105,18 @@ def test_what_is_not_estimable_is_told():
     np.testing.assert_allclose(result.pooled**2, (SMALL**2 + LARGE**2) / 2, rtol=0.1)
 
 
+def test_an_estimable_group_beside_others_that_are_not():
+    """Few good points in vertical pairs, y of their photos not to be told apart: the others are estimated as well."""
+    few = np.arange(16) < 6
+    sigma = np.where(few, by_photo() / 4, 2 * LARGE)
+    pairs, found = batch((0.0,) * 5, sigma, 2_000)
+    left, right = (np.where(few, k, 2) for k in (0, 1))
+    result = components.estimate(pairs, found, (left, left, right, right))
+    np.testing.assert_array_equal(result.estimable, [False, False, True])
+    assert bool(result.converged)
+    assert abs(float(result.sigma[2]) - 2 * LARGE) < 2 * float(result.standard_error[2])
+
+
 def test_restricted_likelihood_is_largest():
     """The maximum over both variances, found by SciPy on dense matrices of all pairs."""
     pairs, found = batch(CONVERGENT, by_photo(), 120)
