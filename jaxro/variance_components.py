@@ -103,33 +103,40 @@ def _estimate(data: tuple[Pair, Orientation], *, labels: tuple[Array, ...], size
     pooled = jnp.sum(q) / jnp.where(there, freedom, 1.0)
     safe = jnp.where(pooled > 0, pooled, 1.0)
     estimable = there & (_errors(f) < SURE)
-    prior = jnp.diag(jnp.where(estimable, 0.0, 2 / (SURE * safe) ** 2))
+    prior = jnp.where(estimable, 0.0, 2 / (SURE * safe) ** 2)
+    least = FLOOR * pooled
+
+    def solved(f, q, centre, prior):
+        right = q - jnp.sum(f * centre[None, :], axis=1)
+        return centre + jnp.stack(normal.solve(_lower(f + jnp.diag(prior)), list(right)))
 
     def scored(_, state):
         theta, _ = state
         f, q = _unpacked(equations(theta), size)
-        right = q - jnp.sum(f * pooled, axis=1)
-        new = pooled + jnp.stack(normal.solve(_lower(f + prior), list(right)))
-        new = jnp.where(new > FLOOR * pooled, new, FLOOR * pooled)
+        new = solved(f, q, one * pooled, prior)
+        # the others have to know that these are zero and not negative
+        out = new < least
+        new = solved(f, q, jnp.where(out, least, pooled), prior + jnp.where(out, 1e9 * jnp.diagonal(f), 0.0))
+        new = jnp.where(new > least, new, least)
         return new, jnp.max(jnp.where(estimable, jnp.abs(new - theta), 0.0)) / safe
 
     theta, change = jax.lax.fori_loop(0, steps, scored, (one * pooled, pooled))
     f, _ = _unpacked(equations(theta), size)
-    error = _errors(f + prior)
+    error = _errors(f + jnp.diag(prior))
     estimable = estimable & (error < SURE * pooled)
-    positive = estimable & (theta > FLOOR * pooled)
+    positive = estimable & (theta > least)
     sigma = jnp.where(positive, jnp.sqrt(theta), 0.0)
     both = estimable[:, None] & estimable[None, :]
     return Components(
         sigma,
         jnp.where(positive, error / jnp.where(positive, 2 * sigma, 1.0), jnp.inf),
         jnp.where(estimable, error, jnp.inf),
-        jnp.where(both, 2 * _inverse(f + prior), 0.0),
+        jnp.where(both, 2 * _inverse(f + jnp.diag(prior)), 0.0),
         estimable,
         jnp.sqrt(pooled),
         theta * jnp.sum(f * theta[None, :], axis=1),
         freedom.astype(int),
-        change < 1e-9,
+        change < 1e-6,
     )
 
 
