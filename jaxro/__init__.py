@@ -15,9 +15,11 @@ from . import (
     critical_values as critical_values,
     losses as losses,
     rejection as rejection,
+    reliability as reliability,
     rotations as rotations,
     simulation as simulation,
     starts as starts,
+    variance_components as variance_components,
 )
 from .adjustment import Adjustment as Adjustment, adjust as adjust
 from .batch import clean_batch as clean_batch, map_batch as map_batch, orient_batch as orient_batch
@@ -42,6 +44,7 @@ from .pairs import (
     swapped as swapped,
     unstack as unstack,
 )
+from .reliability import Reliability as Reliability, assess as assess
 from .results import RESULTS as RESULTS, is_usable as is_usable
 
 __version__ = "0.1.0"

@@ -31,6 +31,76 @@ def test_chi_squared():
     np.testing.assert_allclose(critical.chi_squared(level, freedom), stats.chi2.isf(level, freedom), rtol=1e-9)
 
 
+def test_chi_squared_bounds():
+    level, freedom = GRID
+    low, high = critical.chi_squared_bounds(level, freedom)
+    np.testing.assert_allclose(low, stats.chi2.ppf(level / 2, freedom), rtol=1e-9)
+    np.testing.assert_allclose(high, stats.chi2.isf(level / 2, freedom), rtol=1e-9)
+
+
+def test_fisher():
+    level, above, below = (a.ravel() for a in np.meshgrid(LEVELS, FREEDOMS, FREEDOMS))
+    # the incomplete beta function keeps seven digits where F is beyond 1e6
+    level, above, below = (a[(below > 2) | (level > 1e-5)] for a in (level, above, below))
+    np.testing.assert_allclose(critical.fisher(level, above, below), stats.f.isf(level, above, below), rtol=1e-7)
+    level, freedom = (a[GRID[1] > 2] for a in GRID)
+    np.testing.assert_allclose(critical.fisher(level, 1, freedom), critical.student(level / 2, freedom) ** 2, rtol=1e-8)
+
+
+def test_sidak():
+    np.testing.assert_allclose(
+        critical.sidak(0.05, np.array([1, 8, 1e6])), [0.05, 0.006391150774, 5.1293291e-8], rtol=1e-6
+    )
+    np.testing.assert_allclose(1 - (1 - critical.sidak(LEVELS, 16)) ** 16, LEVELS, rtol=1e-6)
+
+
+DELTAS = np.array([0.0, 0.3, 2.0, 4.13, 8.0, 30.0])
+
+
+@pytest.mark.parametrize("limit", [0.1, 1.0, 5.0, 11.0, 40.0, 200.0, 1100.0])
+def test_non_central_chi_squared(limit):
+    freedom, delta = (a.ravel() for a in np.meshgrid(FREEDOMS, DELTAS))
+    expected = stats.ncx2.sf(limit, freedom, np.maximum(delta**2, 1e-13))
+    np.testing.assert_allclose(critical.chi_squared_power(limit, freedom, delta), expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("limit", [0.5, 2.0, 3.3, 8.0, 31.0, 636.0])
+def test_non_central_student(limit):
+    freedom, delta = (a.ravel() for a in np.meshgrid(FREEDOMS[:-1], np.append(DELTAS, [60.0, 700.0])))
+    expected = stats.nct.sf(limit, freedom, delta) + stats.nct.cdf(-limit, freedom, delta)
+    known = np.isfinite(expected)  # SciPy has none far out
+    assert np.mean(known) > 0.6
+    found = np.asarray(critical.student_power(limit, freedom, delta))
+    np.testing.assert_allclose(found[known], expected[known], atol=1e-9)
+    assert np.all(np.isfinite(found)) and np.all(found > -1e-9) and np.all(found < 1 + 1e-9)
+
+
+def test_delta_is_found_with_the_promised_power():
+    """Against SciPy's distributions, and Baarda's tabulated 4.13 (level 0.001, power 0.80) and 2.80 (0.05, 0.80)."""
+    np.testing.assert_allclose(critical.delta_normal(np.array([0.001, 0.05]), 0.8), [4.13, 2.80], atol=5e-3)
+    level, power = (a.ravel() for a in np.meshgrid([0.3, 0.05, 1e-3, 1e-6], [0.5, 0.8, 0.95, 0.999]))
+    delta = np.asarray(critical.delta_normal(level, power))
+    np.testing.assert_allclose(stats.ncx2.sf(stats.chi2.isf(level, 1), 1, delta**2), power, rtol=1e-9)
+    for freedom in (1.0, 2.0, 11.0, 300.0):
+        delta = np.asarray(critical.delta_chi_squared(level, power, freedom))
+        np.testing.assert_allclose(stats.ncx2.sf(stats.chi2.isf(level, freedom), freedom, delta**2), power, rtol=1e-9)
+    np.testing.assert_allclose(
+        critical.delta_student(level, power, 1e5), critical.delta_normal(level, power), rtol=1e-3
+    )
+    for freedom in (5.0, 11.0, 100.0):
+        delta = np.asarray(critical.delta_student(0.001, 0.8, freedom))
+        t = stats.t.isf(0.0005, freedom)
+        np.testing.assert_allclose(stats.nct.sf(t, freedom, delta), 0.8, rtol=1e-8)
+
+
+def test_b_method_has_the_power_of_the_single_test():
+    freedom = np.array([1.0, 2.0, 11.0, 100.0, 1000.0])
+    level = np.asarray(critical.b_method(0.001, 0.8, freedom))
+    delta = float(critical.delta_normal(0.001, 0.8))
+    np.testing.assert_allclose(stats.ncx2.sf(stats.chi2.isf(level, freedom), freedom, delta**2), 0.8, rtol=1e-9)
+    np.testing.assert_allclose(level[0], 0.001, rtol=1e-9)
+
+
 def test_tau_is_a_beta_quantile():
     """tau² / f ~ Beta(1/2, (f - 1)/2); never above sqrt(f)."""
     level, freedom = (a[GRID[1] > 1] for a in GRID)

@@ -1,0 +1,271 @@
+"""What a finished orientation can tell of errors in its measurements: which would be seen, what hidden ones would do.
+
+Of the Gauss-Helmert model A x + B v + g = 0 with one condition per point, D = B Q Bᵀ its variance for sigma0 = 1,
+h = a N⁻¹ aᵀ / D its leverage (Baarda 1968; Pope 1976; Förstner 1979, 1987; Caspary 1988):
+
+    redundancy number         r = 1 - h                                    Σ r = n - 5
+    Baarda's w                g / (sigma0 sqrt(D r))                       normal
+    internally studentised    tau: the estimated sigma0 in its place       tau distribution of n - 5
+    externally studentised    t: sigma0 estimated without this point       Student's t of n - 6
+    of a coordinate           r_k = r B_k² Q_k / D
+    detectable error          delta0 sigma0 sqrt(Q_k / r_k) = delta0 sigma0 sqrt(D / r) / |B_k|
+    effect on the elements    N⁻¹ aᵀ / D times the error of g, delta0 sigma0 sqrt(D / r)
+    external reliability      delta0 sqrt(h / r): no function of the elements moves by more of its standard deviations
+
+The four coordinates of a point enter one condition: an error in any of them gives the same w, and where it is just
+detectable the same effect on the elements. All is of first order, at the measured coordinates.
+"""
+
+from functools import lru_cache
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import betainc, gammainc, gammaincc, ndtr
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from . import critical_values as critical
+from .conditions import Linear, linearised
+from .external_reliability import effects, root
+from .normal_equations import accumulate, cholesky, substitute
+from .orientation import Orientation
+from .pairs import Coordinates, Pair, cleaned
+from .programs import QUICK, Program, stage, traced
+from .reductions import count
+
+PerPoint = Float[Array, "*pairs point"]
+PerPair = Float[Array, "*pairs"]
+PerElement = Float[Array, "*pairs 5"]
+
+UNTESTABLE = 1e-6
+"""Redundancy number below which an observation is not checked by the others."""
+
+CONTROL = ("not", "poorly", "sufficiently", "well")
+"""How an observation is controlled, by the class of its redundancy number."""
+
+BOUNDS = (0.01, 0.1, 0.3)
+"""Redundancy numbers that part the classes (Förstner 1979)."""
+
+
+class Reliability(eqx.Module):
+    """The reliability of an orientation; for a batch every field has leading axes. Masked points are zero and False.
+
+    Per point: `redundancy`; `w`, `tau`, `t` with the sign of g; whether it is `testable`: errors in it show at all.
+    Where it is not, w, tau and t are 0 and what could hide is infinite. `effect` of the detectable error on the
+    elements (in their order and unit), `effect_m_q`, and `external`, their bound in standard deviations.
+    Per coordinate (x_left, y_left, x_right, y_right): `coordinate_redundancy`, the `detectable` error in the unit of
+    the coordinates, and `effect_height`: what it does to the model height Z of its point.
+    Per pair: the `largest` effects on the elements, on m_q, and of `external`; `correlation` of the elements;
+    `significance`, element over standard deviation (0 for `RelativePose`, whose local parameters have no values).
+
+    `sigma0` is the a-priori standard deviation of unit weight where it is `known`, else the estimated one, and w is
+    then tau. `limit`: what |w| exceeds with probability `level` when a point has no error.
+    """
+
+    redundancy: PerPoint
+    w: PerPoint
+    tau: PerPoint
+    t: PerPoint
+    testable: Bool[Array, "*pairs point"]
+    coordinate_redundancy: Coordinates
+    detectable: Coordinates
+    effect: tuple[PerPoint, ...]
+    effect_m_q: PerPoint
+    effect_height: Coordinates
+    external: PerPoint
+    largest: PerElement
+    largest_m_q: PerPair
+    largest_external: PerPair
+    correlation: Float[Array, "*pairs 5 5"]
+    significance: PerElement
+    sigma0: PerPair
+    estimated: PerPair
+    degrees_of_freedom: Int[Array, "*pairs"]
+    level: PerPair
+    limit: PerPair
+    known: bool = eqx.field(static=True)
+    power: float = eqx.field(static=True)
+
+    @property
+    def suspicious(self) -> Bool[Array, "*pairs point"]:
+        """The points whose |w| exceeds the limit. Only the largest is evidence of an error in its own point."""
+        return self.testable & (jnp.abs(self.w) > self.limit[..., None])
+
+    @property
+    def control(self) -> tuple[Int[Array, "*pairs point"], ...]:
+        """Class of every coordinate, an index of `CONTROL`."""
+        return tuple(controllability(r) for r in self.coordinate_redundancy)
+
+    def p_values(self) -> PerPoint:
+        """Of every point: how often |w| is larger when no point has an error; 1 where it cannot be tested.
+
+        Normal where sigma0 is known, else of t.
+        """
+        return jnp.where(self.testable, 2 * ndtr(-jnp.abs(self.w)), 1.0) if self.known else self.p_student()
+
+    def p_student(self) -> PerPoint:
+        """The same by t, which needs no sigma0 and two degrees of freedom; 1 with fewer."""
+        freedom = (self._freedom - 1)[..., None]
+        return jnp.where(self.testable & (freedom > 0), student_p(self.t, freedom), 1.0)
+
+    def global_p(self) -> PerPair:
+        """Of the two-sided chi-squared test of the estimated sigma0 against the known one; 1 where there is no test:
+        no degree of freedom, or sigma0 not known."""
+        there = self.known & (self.degrees_of_freedom > 0)
+        f = jnp.where(there, self._freedom, 1.0)
+        half = f * jnp.where(there, self.estimated / self.sigma0, 1.0) ** 2 / 2
+        below, above = gammainc(f / 2, half), gammaincc(f / 2, half)
+        return jnp.where(there, jnp.where(below < above, 2 * below, 2 * above), 1.0)
+
+    def b_level(self) -> PerPair:
+        """The level of the one-sided global test that sees what the tests of the points see (Baarda's B-method)."""
+        return critical.b_method(self.level, self.power, jnp.where(self._freedom > 0, self._freedom, 1.0))
+
+    def significance_p(self) -> PerElement:
+        """How often an element that is zero appears as large as this one; 1 where nothing can be said."""
+        size = jnp.abs(self.significance)
+        f = jnp.where(self._freedom > 0, self._freedom, 1.0)[..., None]
+        return jnp.where(size > 0, 2 * ndtr(-size) if self.known else student_p(size, f), 1.0)
+
+    def correlated(self, limit: float = 0.95) -> Bool[Array, "*pairs 5 5"]:
+        """The pairs of elements correlated above the limit, in the upper triangle."""
+        return (jnp.abs(self.correlation) > limit) & jnp.triu(jnp.ones((5, 5), bool), 1)
+
+    @property
+    def _freedom(self) -> PerPair:
+        return self.degrees_of_freedom.astype(self.estimated.dtype)
+
+
+def controllability(redundancy: ArrayLike) -> Int[Array, "..."]:
+    """0 to 3 (see `CONTROL`): below 0.01, below 0.1, below 0.3, above."""
+    return sum(jnp.where(jnp.asarray(redundancy) < bound, 0, 1) for bound in BOUNDS)  # pyright: ignore
+
+
+def student_p(t: ArrayLike, freedom: ArrayLike) -> Float[Array, "..."]:
+    """How often |t| is larger by chance, `freedom` broadcast to t."""
+    t = jnp.asarray(t)
+    f = jnp.broadcast_to(jnp.where(jnp.asarray(freedom) > 0, freedom, 1.0), t.shape)
+    return betainc(f / 2, jnp.full_like(t, 0.5), f / (f + t**2))
+
+
+def assess(
+    pair: Pair,
+    orientation: Orientation,
+    *,
+    sigma0: ArrayLike | None = None,
+    level: float = 0.001,
+    power: float = 0.80,
+    familywise: bool = False,
+) -> Reliability:
+    """The reliability of one pair at its orientation (by `coplanarity.rigorous`, without a loss).
+
+    `sigma0`: the a-priori standard deviation of unit weight: 1 where pair.sigma are the true standard deviations, that
+    of a coordinate where the pair has unit sigma. None where it is not known: the estimated one then stands in its
+    place, detectable errors are those of the t test, and nothing is testable with less than two degrees of freedom.
+    `level` of the test of each point, or (`familywise`) of all together by Šidák; `power` with which detectable errors
+    are found. Works under jit and vmap. A pair whose orientation is not usable has nothing testable.
+    """
+    if pair.x_left.ndim != 1:
+        raise ValueError(f"assess takes one pair, but the coordinates have shape {pair.x_left.shape}: use jax.vmap")
+    sigma0 = None if sigma0 is None else jnp.asarray(sigma0, pair.x_left.dtype)
+    options = {"sigma0": sigma0, "level": level, "power": power, "familywise": familywise}
+    if traced((pair, orientation, sigma0)):
+        return _assess((pair, orientation), **options)
+    return Program(_assess, options, QUICK)((pair, orientation))
+
+
+def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: float, power: float, familywise: bool):
+    pair, orientation = cleaned(read[0])[0], read[1]
+    use = pair.mask & orientation.usable
+    linear = linearised(pair, orientation.pose)
+    z, h, squares = stage(_solved)(linear)
+    r = jnp.where(use, 1 - h, 0.0)
+    points = count(use)
+    freedom = jnp.where(points > 5, points - 5, 0.0)
+    estimated = root(squares / jnp.where(freedom > 0, freedom, 1.0), freedom > 0)
+    known = sigma0 is not None
+    unit = estimated if sigma0 is None else sigma0
+    testable = use & (r > UNTESTABLE) & (freedom > (0 if known else 1)) & (unit > 0)
+
+    safe = jnp.where(testable, r, 1.0)
+    spread = jnp.where(testable, jnp.sqrt(safe / jnp.where(testable, linear.weight, 1.0)), 1.0)  # sqrt(r D)
+    standard = lambda scale: (
+        jnp.where(testable & (scale > 0), linear.g * linear.weight * spread / safe, 0.0)
+        / jnp.where(scale > 0, scale, 1.0)
+    )
+    tau = standard(estimated)
+    rest = freedom - tau**2
+    outer = testable & (freedom > 1)
+    t = jnp.where(outer, tau * jnp.sqrt(jnp.where(outer, freedom - 1, 1.0) / jnp.where(rest > 1e-12, rest, 1e-12)), 0.0)
+
+    tests = _tests(pair.mask.shape[0], known, level, power, familywise)
+    delta, limit, each = (critical.by_count(lambda _, t=t: t, pair.mask.shape[0], points) for t in tests)
+    # of g: delta sigma0 sqrt(D / r), and what it does to the local parameters of the pose
+    jump, shift = stage(_moved)(z, linear.weight, jnp.where(testable, delta * unit * spread / safe, 0.0))
+    parts = tuple(b**2 * pair.sigma**2 * linear.weight * r for b in linear.gradient)
+    seen = tuple(testable & (part > UNTESTABLE) for part in parts)
+    hidden = lambda value, seen: jnp.where(use, jnp.where(seen, value, jnp.inf), 0.0)
+
+    done = effects(pair, orientation, linear, shift, jump, r)
+    effect = tuple(hidden(e, testable) for e in done.elements)
+    effect_m_q = hidden(done.m_q, testable)
+    external = hidden(delta * jnp.sqrt(jnp.where(testable, h, 0.0) / safe), testable)
+    most = lambda value: jnp.where(orientation.usable, jnp.max(value, axis=-1), jnp.inf)
+
+    deviations = jnp.sqrt(jnp.diagonal(orientation.cofactor))
+    values = jnp.stack(orientation.elements.values())
+    spread_of = unit * deviations
+    sure = orientation.usable & (spread_of > 0)
+    return Reliability(
+        r,
+        standard(unit),
+        tau,
+        t,
+        testable,
+        parts,
+        tuple(hidden(jump / jnp.where(s, jnp.abs(b), 1.0), s) for b, s in zip(linear.gradient, seen, strict=True)),
+        effect,
+        effect_m_q,
+        tuple(hidden(z, s) for z, s in zip(done.height, seen, strict=True)),
+        external,
+        jnp.stack([most(e) for e in effect]),
+        most(effect_m_q),
+        most(external),
+        orientation.cofactor / (deviations[:, None] * deviations[None, :]),
+        jnp.where(sure, values / jnp.where(sure, spread_of, 1.0), 0.0),
+        unit,
+        estimated,
+        freedom.astype(int),
+        each,
+        limit,
+        known,
+        power,
+    )
+
+
+def _solved(linear: Linear):
+    """N⁻¹ aᵀ and leverage of every point, and Σ g² / d."""
+    n, _, squares = accumulate([linear.g], [[c] for c in linear.columns], [linear.weight])
+    z = substitute(cholesky(n)[0], linear.columns)
+    return z, linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True)), squares
+
+
+def _moved(z: list[Array], weight: Array, jump: Array):
+    """The jumps, and the shifts of the local parameters by them."""
+    return jump, [-entry * weight * jump for entry in z]
+
+
+@lru_cache(maxsize=64)
+def _tests(most: int, known: bool, level: float, power: float, familywise: bool) -> tuple[Any, ...]:
+    """delta0, limit of |w| and level of the test of a point, for pairs of 0 to `most` points."""
+    with jax.ensure_compile_time_eval():
+        n = jnp.arange(most + 1.0)
+        alone = critical.sidak(level, n) if familywise else jnp.full_like(n, level)
+        if known:
+            delta, limit = critical.delta_normal(alone, power), critical.normal(alone)
+        else:
+            freedom = jnp.maximum(n - 5, 2.0)
+            delta, limit = critical.delta_student(alone, power, freedom - 1), critical.tau(alone, freedom)
+        return np.asarray(delta), np.asarray(limit), np.asarray(alone)
