@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .adjustment import Adjustment, moved
 from .orientation import Orientation
+from .reductions import total
 
 
 def jacobian(function: Callable, values: PyTree, *, has_aux: bool = False) -> Any:
@@ -66,7 +67,7 @@ def propagate_each(function: Callable, values: PyTree, deviations: PyTree) -> Py
         numbers, s = entries[: structure.num_leaves], entries[structure.num_leaves :]
         push = jax.linearize(lambda *x: function(jax.tree.unflatten(structure, x)), *numbers)[1]
         moved_by = [push(*(e if i == k else jnp.zeros_like(e) for i, e in enumerate(s))) for k in range(len(s))]
-        return jax.tree.map(lambda first, *rest: root(sum((d**2 for d in rest), first**2)), *moved_by)
+        return jax.tree.map(lambda *d: root(total(jnp.stack(d, axis=-1) ** 2)), *moved_by)
 
     return jax.tree.map(lambda a: a.reshape(arrays[0].shape), jax.vmap(one)(*flat))
 
