@@ -17,10 +17,9 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from .orientation import orient
 from .pairs import Pair
-from .programs import QUICK, Program, traced
 from .propagation import jacobian, root
 from .reductions import total
-from .sensitivity import Quantity, heights
+from .sensitivity import Quantity, heights, run
 from .simulation import planted
 
 
@@ -153,13 +152,9 @@ def error_budget(
     Without `base` lengths are relative: the mean x-parallax is taken as its length and as free of error. Works under
     jit and vmap.
     """
-    base = None if base is None else jnp.asarray(base, pair.x_left.dtype)
     number = lambda leaf: jnp.asarray(leaf, pair.x_left.dtype) if isinstance(leaf, float | np.ndarray) else leaf
-    settings = {"sources": jax.tree.map(number, dict(sources)), "quantity": quantity, "base": base}
-    if traced((pair, settings, options)):
-        return _error_budget(pair, **settings, **options)
-    options = options | {"start": orient(pair, base=base, **options).pose}
-    return Program(_error_budget, settings | options, QUICK)(pair)
+    more = {"sources": jax.tree.map(number, dict(sources)), "quantity": quantity}
+    return run(_error_budget, pair, options | {"base": base}, more)
 
 
 def _error_budget(pair: Pair, *, sources, quantity, base, **options) -> ErrorBudget:

@@ -136,8 +136,8 @@ class Trace(AbstractCriterion):
 
 
 class DetectableError(AbstractCriterion):
-    """The largest minimal detectable error of the y coordinates, or of those whose numbers are given (of x_left, y_left,
-    x_right, y_right)."""
+    """The largest minimal detectable error of the y coordinates; or of others, by their numbers among x_left, y_left,
+    x_right, y_right."""
 
     largest: ClassVar[bool] = True
     coordinates: tuple[int, ...] = (1, 3)
@@ -150,7 +150,10 @@ class DetectableError(AbstractCriterion):
 
 class HeightDeviation(AbstractCriterion):
     """The largest standard deviation of a model height, of new points on a grid over the overlap, measured as well as
-    the others; in the unit of the base. They lie on the terrain, or in the plane where the points keep heights."""
+    the others; in the unit of the base. They lie on the terrain, or in the plane where the points keep heights.
+
+    Z counts in the frame of the elements, which hangs on the left photo: mirrored from left to right a layout has other
+    heights."""
 
     largest: ClassVar[bool] = True
     grid: int = 5
@@ -164,7 +167,7 @@ class HeightDeviation(AbstractCriterion):
         return height_deviations(plan.adjustment, photographed(box, (x, y), plan.pair.sigma[0]), box.base)
 
 
-def detectable_errors(pair: Pair, adjustment: Adjustment, delta0: ArrayLike = DELTA0) -> tuple[Array, ...]:
+def detectable_errors(pair: Pair, adjustment: Adjustment, delta0: ArrayLike = DELTA0) -> list[Array]:
     """The minimal detectable error of each coordinate l of every point, x_left, y_left, x_right, y_right (Baarda 1968):
 
         delta0 sqrt(B Q Bᵀ) / (|dg/dl| sqrt(r)),
@@ -177,9 +180,9 @@ def detectable_errors(pair: Pair, adjustment: Adjustment, delta0: ArrayLike = DE
         b = jax.grad(coplanarity.condition, argnums=1)(f, point)
         d = sum(e**2 for e in b)
         own = [r * e**2 / d for e in b]
-        return tuple(delta0 * sigma / jnp.sqrt(jnp.where(e > 1e-16, e, 1e-16)) for e in own)
+        return [delta0 * sigma / jnp.sqrt(jnp.where(e > 1e-16, e, 1e-16)) for e in own]
 
-    return jax.vmap(one)(pair.coordinates, pair.sigma, adjustment.redundancy)
+    return jax.vmap(one)(pair.coordinates, pair.sigma, adjustment.redundancy)  # pyright: ignore[reportReturnType]
 
 
 def height_deviations(adjustment: Adjustment, points: Pair, base: ArrayLike) -> Float[Array, "point"]:
@@ -251,12 +254,14 @@ def _design(key, *, criterion, overlap, points, starts, sigma, start, kept) -> D
     kept = () if kept is None else tuple(jnp.asarray(a, float) for a in kept)
 
     def plan(free: Positions) -> Plan:
-        return planned(overlap, tuple(map(jnp.concatenate, zip(free, kept, strict=True))) if kept else free, sigma)
+        x, y = (jnp.concatenate(both) for both in zip(free, kept, strict=True)) if kept else free
+        return planned(overlap, (x, y), sigma)
 
-    def places(u: Positions) -> Positions:
-        return tuple((low + high) / 2 + (high - low) / 2 * jnp.sin(a) for (low, high), a in zip(sides, u, strict=True))
+    def places(u: tuple[Array, ...]) -> Positions:
+        x, y = ((low + high) / 2 + (high - low) / 2 * jnp.sin(a) for (low, high), a in zip(sides, u, strict=True))
+        return x, y
 
-    def improved(first: Positions):
+    def improved(first: tuple[Array, ...]):
         def stage(u, p):
             found = optx.minimise(
                 lambda u, p: criterion.logarithm(plan(places(u)), p),
@@ -271,7 +276,7 @@ def _design(key, *, criterion, overlap, points, starts, sigma, start, kept) -> D
         inside = lambda a, side: jnp.clip((2 * a - side[0] - side[1]) / (side[1] - side[0]), -0.99, 0.99)
         u = tuple(jnp.arcsin(inside(a, side)) for a, side in zip(first, sides, strict=True))
         u, converged = lax.scan(stage, u, jnp.asarray(NORMS[: 2 if criterion.largest else 1]))
-        before, after = criterion(plan(first)), criterion(plan(places(u)))
+        before, after = criterion(plan((first[0], first[1]))), criterion(plan(places(u)))
         better = after < before
         end = jax.tree.map(lambda a, b: jnp.where(better, a, b), places(u), first)
         return end, before, jnp.where(better, after, before), converged[-1]

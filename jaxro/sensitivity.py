@@ -89,7 +89,7 @@ def derivatives(pair: Pair, quantity: Quantity, **options) -> Derivatives:
     One value is its own unit over that of the coordinates. A focal length that both photos share has the sum of both
     derivatives. Works under jit and vmap.
     """
-    return _run(_derivatives, pair, options, {"quantity": quantity})
+    return run(_derivatives, pair, options, {"quantity": quantity})
 
 
 def _derivatives(pair: Pair, *, quantity: Quantity, **options) -> Derivatives:
@@ -106,13 +106,16 @@ def _derivatives(pair: Pair, *, quantity: Quantity, **options) -> Derivatives:
     return Derivatives(value, usable, *by, (shifts[0], shifts[1]), (shifts[2], shifts[3]))
 
 
-def _run(function: Callable, pair: Pair, options: dict[str, Any], more: dict[str, Any]) -> Any:
-    """function(pair, **options, **more), compiled where nothing is traced, and then begun at the solution."""
+def run(function: Callable, pair: Pair, options: dict[str, Any], more: dict[str, Any]) -> Any:
+    """function(pair, **options, **more), compiled where nothing is traced, and begun at the solution if no start is
+    given, so that the general start is in no program with derivatives."""
     if options.get("base") is not None:
         options = options | {"base": jnp.asarray(options["base"], pair.x_left.dtype)}
     if traced((pair, options, more)):
         return function(pair, **options, **more)
-    return Program(function, options | more | {"start": orient(pair, **options).pose}, QUICK)(pair)
+    if "start" not in options:
+        options = options | {"start": orient(pair, **options).pose}
+    return Program(function, options | more, QUICK)(pair)
 
 
 class PointInfluence(NamedTuple):
@@ -132,7 +135,7 @@ class PointInfluence(NamedTuple):
 
 def point_influence(pair: Pair, **options) -> PointInfluence:
     """What each point does to the elements of orient(pair, **options). Works under jit and vmap."""
-    return _run(_point_influence, pair, options, {})
+    return run(_point_influence, pair, options, {})
 
 
 def _point_influence(pair: Pair, **options) -> PointInfluence:
