@@ -14,6 +14,7 @@ from . import (
     budget as budget,
     coplanarity as coplanarity,
     critical_values as critical_values,
+    layout_design as layout_design,
     losses as losses,
     propagation as propagation,
     rejection as rejection,
