@@ -130,7 +130,10 @@ class Source(AbstractSource):
 
 class ErrorBudget(NamedTuple):
     """A result, the standard deviation of each of its numbers from all sources together, and by the name of the source
-    its variances and its shares, which add up to 1 (all 0 where there is no variance, as at masked points)."""
+    its variances and its shares, which add up to 1 (all 0 where there is no variance, as at masked points).
+
+    Where the orientation is not usable the standard deviations are infinite and the rest is 0.
+    """
 
     value: PyTree
     usable: Array
@@ -169,6 +172,7 @@ def _error_budget(pair: Pair, *, sources, quantity, base, **options) -> ErrorBud
         return value, (value, found.usable)
 
     by, (value, usable) = jacobian(of, jax.tree.map(jnp.zeros_like, deviations), has_aux=True)
+    by = jax.tree.map(lambda d: jnp.where(usable, d, 0.0), by)
     by = jax.tree.transpose(jax.tree.structure(value), jax.tree.structure(deviations), by)
 
     def variance(name: str) -> PyTree:
@@ -182,7 +186,7 @@ def _error_budget(pair: Pair, *, sources, quantity, base, **options) -> ErrorBud
     return ErrorBudget(
         value,
         usable,
-        jax.tree.map(root, whole),
+        jax.tree.map(lambda v: jnp.where(usable, root(v), jnp.inf), whole),
         variances,
         {name: jax.tree.map(share, v, whole) for name, v in variances.items()},
     )

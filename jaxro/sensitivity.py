@@ -4,7 +4,7 @@ elements.
 A result is a quantity(Orientation), any pytree of numbers: `elements`, `heights`, `lambda o: o.sigma0`. Its derivatives
 are those of the finished non-linear adjustment (implicit function theorem), the second-order term of the residuals
 included: they are exact at any size of the residuals, where those of the normal equations alone, -(AᵀPA)⁻¹AᵀP, are
-not. Where an orientation is not usable they are finite and mean nothing.
+not. Where an orientation is not usable they are zero, and `usable` says so.
 
 A length of the base that is not given is a choice, not a measurement: it has no derivative. For heights in mm give
 `base`.
@@ -101,6 +101,7 @@ def _derivatives(pair: Pair, *, quantity: Quantity, **options) -> Derivatives:
 
     inputs = (*pair.coordinates, pair.focal_left, pair.focal_right)
     by, (value, usable) = jacobian(of, inputs, has_aux=True)
+    by = jax.tree.map(lambda d: jnp.where(usable, d, 0.0), by)
     by = jax.tree.transpose(jax.tree.structure(value), jax.tree.structure(inputs), by)
     shifts = [jax.tree.map(lambda d: -total(d), d) for d in by[:4]]
     return Derivatives(value, usable, *by, (shifts[0], shifts[1]), (shifts[2], shifts[3]))

@@ -19,6 +19,7 @@ from jaxro import (
     RelativePose,
     budget,
     pad,
+    pair,
     propagation,
     sensitivity,
     simulation,
@@ -49,9 +50,11 @@ def everything(orientation):
 
 @lru_cache
 def cases():
-    """Residuals of three times the usual size, and a point 100 sigma off; two places are empty, and hold NaN."""
+    """Residuals of three times the usual size; a point 100 sigma off; points that are all the same. Two places are
+    empty, and hold NaN."""
     bad = simulation.planted(problems.tilted(SIGMA), y_right=np.where(np.arange(POINTS) == 6, 100 * SIGMA, 0.0))
-    pairs = stack([pad(one, PLACES) for one in (problems.tilted(3 * SIGMA), bad)])
+    nothing = pair(*(np.zeros(POINTS),) * 4, focal=BASE)
+    pairs = stack([pad(one, PLACES) for one in (problems.tilted(3 * SIGMA), bad, nothing)])
     return eqx.tree_at(lambda p: p.x_right, pairs, pairs.x_right.at[:, POINTS:].set(jnp.nan))
 
 
@@ -130,6 +133,11 @@ def test_masked_points_have_no_derivative():
     for name in FIELDS[:4]:
         for leaf in jax.tree.leaves(getattr(exact(), name)):
             assert np.all(leaf[..., POINTS:] == 0) and np.any(leaf[..., :POINTS])
+
+
+def test_unusable_orientations_have_no_derivative():
+    assert exact().usable.tolist() == [True, True, False]
+    assert not any(np.any(leaf[2]) for name in FIELDS for leaf in jax.tree.leaves(getattr(exact(), name)))
 
 
 def test_second_order_term():
