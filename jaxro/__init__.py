@@ -11,12 +11,16 @@ if "JAX_ENABLE_X64" not in _os.environ:
     _jax.config.update("jax_enable_x64", True)
 
 from . import (
+    budget as budget,
     coplanarity as coplanarity,
     critical_values as critical_values,
+    layout_design as layout_design,
     losses as losses,
+    propagation as propagation,
     rejection as rejection,
     reliability as reliability,
     rotations as rotations,
+    sensitivity as sensitivity,
     simulation as simulation,
     starts as starts,
     variance_components as variance_components,
