@@ -23,6 +23,11 @@ class Linear(NamedTuple):
     gradient: Coordinates
     weight: Values
 
+    @property
+    def squares(self) -> Values:
+        """(r / sigma)² of the points."""
+        return self.weight * self.g * self.g
+
     def corrections(self, pair: Pair) -> Coordinates:
         """v = -Q Bᵀ g / d of the coordinates, which bring the rays to intersection."""
         factor = -self.g * self.weight * pair.sigma**2

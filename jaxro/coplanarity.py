@@ -135,6 +135,9 @@ def intersection(
     Parallel rays give λ = μ = inf with the sign of the side they would meet on.
     """
     first, second, squared, lam, mu = rays(left, right, base, point, focal_left, focal_right)
-    lam, mu = lam / squared, mu / squared
-    half = tuple((lam * p + b + mu * s) / 2 for p, b, s in zip(first, base, second, strict=True))
-    return half, lam, mu  # pyright: ignore[reportReturnType]
+    parallel = squared == 0
+    # divided by a safe number, or a point at infinity would leave NaN in every derivative
+    near = 1 / jnp.where(parallel, 1.0, squared)
+    half = tuple((lam * near * p + b + mu * near * s) / 2 for p, b, s in zip(first, base, second, strict=True))
+    far = lambda side: jnp.where(parallel, jnp.where(side < 0, -jnp.inf, jnp.inf), side * near)
+    return half, far(lam), far(mu)  # pyright: ignore[reportReturnType]

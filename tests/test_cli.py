@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from test_tables import BAD_CAMERAS, BAD_TABLES, write
 from typer.testing import CliRunner
+from workload import aerial
 
 import jaxro
 from jaxro.cli import app
 from jaxro.io import cameras, example, tables
 
-FILES = {"elements.csv", "residuals.csv", "points.csv", "summary.json"}
+FILES = {"elements.csv", "residuals.csv", "points.csv", "reliability.csv", "summary.json"}
 FOCAL = ["--focal", str(example.FOCAL)]
 
 
@@ -90,6 +91,30 @@ def test_files_hold_the_python_result_to_the_bit(sample, tmp_path):
     (only,) = summary["pairs"]
     assert (only["sigma0"], only["elements"]["by"]["value"]) == (float(o.sigma0), values[0])
     assert summary["usable"] == 1 and summary["units"]["sigma0"] == "mm"
+
+
+def test_what_could_hide_is_told_and_written(tmp_path):
+    """Twelve points, one of them wrong by 9 sigma: named; the file holds what `assess` says."""
+    coordinates = [c[0] for c in aerial(1, 12)]
+    coordinates[3][4] += 0.09
+    lines = [
+        "point,x_left,y_left,x_right,y_right",
+        *(f"p{i},{','.join(map(repr, p.tolist()))}" for i, p in enumerate(np.transpose(coordinates))),
+    ]
+    file, out = write(tmp_path, "\n".join(lines), "twelve.csv"), tmp_path / "out"
+    told = " ".join(run(file, "--focal", 150, "--sigma", 0.01, "--out", out).output.split())
+    pair = jaxro.pair(*coordinates, focal=150.0, sigma=0.01)
+    reading = jaxro.assess(pair, jaxro.orient(pair), sigma0=1.0)
+    assert f"Mind: Point p4 has |w| = {abs(float(reading.w[4])):.1f} where 3.29 is allowed" in told
+    assert "times less accurate than their sigma says" in told
+    (poor,) = np.flatnonzero(np.asarray(reading.redundancy) < 0.1)
+    assert f"Poorly checked (redundancy below 0.1): point p{poor}; an error of" in told
+    written = rows(out / "reliability.csv")
+    np.testing.assert_allclose([float(r["w"]) for r in written], reading.w, rtol=1e-9)
+    np.testing.assert_allclose([float(r["detectable_y_right_mm"]) for r in written], reading.detectable[3], rtol=1e-9)
+    assert {r["control_y_left"] for r in written} <= {"not", "poorly", "sufficiently", "well"}
+    without = " ".join(run(file, "--focal", 150).output.split())
+    assert "tau, limit 2.45" in without and "Mind: Point p4" in without
 
 
 def test_every_pair_has_a_row_and_failed_ones_their_advice(sample, tmp_path):

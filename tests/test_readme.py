@@ -10,6 +10,7 @@ import pytest
 
 import jaxro
 from jaxro import losses, starts
+from jaxro.rejection import PROCEDURES
 
 TEXT = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -34,7 +35,7 @@ def column(heading: str) -> list[str]:
     """The names in code font of the first column of the table whose first heading this is."""
     table = re.search(rf"^\| {heading} \|.*\n\|[-| ]+\n((?:\|.*\n)+)", TEXT, re.MULTILINE)
     assert table, f"README.md has no table that begins with '| {heading} |'"
-    return re.findall(r"^\| `(\w+)`", table[1], re.MULTILINE)
+    return re.findall(r"^\| `([\w-]+)`", table[1], re.MULTILINE)
 
 
 def final(module, interface: type) -> list[str]:
@@ -78,6 +79,7 @@ def test_test_command_stands_once():
     [
         ("element system", final(jaxro, jaxro.AbstractElements)),
         ("start", final(starts, starts.AbstractStart)),
+        ("procedure", list(PROCEDURES)),
         ("loss", final(losses, losses.AbstractLoss)),
         ("result", ["successful", *(n for n in jaxro.RESULTS._name_to_item if n not in optx.RESULTS._name_to_item)]),
     ],

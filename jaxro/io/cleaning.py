@@ -18,7 +18,7 @@ from . import files, job as jobs, mock_example, verdict_report, verdicts as judg
 from .buckets import each
 from .console import consoles, progress
 from .job import Example, Job, Options
-from .solutions import Solved, solutions, with_corrections
+from .solutions import Solved, solutions
 from .tables import TableError
 from .tolerances import changed, judges_by_sigma, tolerances
 from .verdicts import Verdict
@@ -78,13 +78,13 @@ def clean_all(
     def one(pair: Pair):
         found, log = jax.tree.map(lambda a: a[0], clean_batch(stack([pair]), procedure, select=select))
         kept = pair.with_mask(found.kept)
-        oriented = with_corrections(orient(kept, **job.keywords), kept)
+        oriented = job.read(orient(kept, **job.keywords), kept)
         return found, log, oriented, Program(_parallaxes, {}, QUICK)((pair, oriented.orientation.pose))
 
     def many(batch: Pair, progress: Callable[[int, int], None]):
         found, log = clean_batch(batch, procedure, select=select, progress=progress)
         kept = batch.with_mask(found.kept)
-        oriented = with_corrections(orient_batch(kept, **job.keywords), kept)
+        oriented = job.read(orient_batch(kept, **job.keywords), kept)
         return found, log, oriented, Program(_all_parallaxes, {})((batch, oriented.orientation.pose))
 
     together = (lambda points: 1 << 40) if job.options.out is None else lambda points: max(1, LOG_NUMBERS // points**2)
@@ -110,6 +110,13 @@ def _all_parallaxes(pairs_and_poses: tuple[Pair, AbstractElements]) -> Float[Arr
     return jax.vmap(_parallaxes)(pairs_and_poses)
 
 
+READ = (
+    *("redundancy", "w", "tau", "t", "testable", "coordinate_redundancy", "detectable"),
+    *("effect", "effect_m_q", "effect_height", "external"),
+)
+"""What a reading holds of every point."""
+
+
 def _of_points(solved: Solved, places: np.ndarray) -> Solved:
     """The orientation with the values of these points only."""
     if not places.size:
@@ -117,5 +124,6 @@ def _of_points(solved: Solved, places: np.ndarray) -> Solved:
     values = lambda s: (
         s.corrections,
         *(getattr(s.orientation, name) for name in ("parallax", "residuals", "redundancy", "model", "in_front")),
+        *(getattr(s.reading, name) for name in READ if s.reading is not None),
     )
     return eqx.tree_at(values, solved, jax.tree.map(lambda a: a[places], values(solved)))

@@ -1,4 +1,5 @@
-"""The files of --out, in full precision, all or none: elements.csv, residuals.csv, points.csv, summary.json.
+"""The files of --out, in full precision, all or none: elements.csv, residuals.csv, points.csv, reliability.csv and
+summary.json.
 
 A number is written as its shortest text that reads back as the same float. What does not exist is an empty cell, null
 in JSON. Headers carry the units; angles are degrees.
@@ -13,6 +14,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from . import reading
 from .solutions import Solution, Units
 from .tables import TableError
 
@@ -26,11 +28,12 @@ def check_target(directory: Path, force: bool) -> None:
 
 
 def texts(solved: list[Solution], units: Units, summary: dict[str, Any]) -> dict[str, str]:
-    """The content of the four files by name."""
+    """The content of the files by name."""
     return {
         "elements.csv": csv_text(_element_rows(solved, units)),
         "residuals.csv": csv_text(_point_rows(solved, RESIDUALS, units)),
         "points.csv": csv_text(_point_rows(solved, POINTS, units)),
+        "reliability.csv": csv_text(reading.file_rows(solved, units)),
         "summary.json": _json(solved, units, summary),
     }
 

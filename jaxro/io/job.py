@@ -11,12 +11,12 @@ from rich.console import Console
 from .. import coplanarity
 from ..batch import orient_batch
 from ..elements import AbstractElements, DependentElements, IndependentElements, RelativePose
-from ..orientation import orient
+from ..orientation import Orientation, orient
 from ..pairs import Camera, Pair
-from . import cameras as camera_files, example, files, report, tables
+from . import cameras as camera_files, example, files, reading, report, solutions, tables
 from .buckets import each
 from .console import consoles, progress
-from .solutions import Solution, Solved, Units, solutions, with_corrections
+from .solutions import Solution, Solved, Units
 from .tables import TableError
 
 SYSTEMS: dict[str, type[AbstractElements]] = {
@@ -82,6 +82,10 @@ class Job:
         """Whether the standard deviation of the coordinates is given."""
         return self.table.has_sigma or self.options.sigma is not None
 
+    def read(self, orientation: Orientation, pair: Pair) -> Solved:
+        """The orientation with what is told of its points; of a batch as well."""
+        return solutions.read(orientation, pair, self.options.residual == "rigorous", self.sigma_known)
+
     @property
     def system_name(self) -> str:
         """The system by its name on the command line."""
@@ -130,8 +134,8 @@ def run(options: Options) -> bool:
     console, errors = consoles()
     warn(errors, job)
     with progress(errors, "Orienting", len(job.pairs)) as told:
-        oriented = orient_all(job.pairs, job.keywords, told)
-    solved = solutions(job.table.pairs, job.cameras, oriented, job.units)
+        oriented = orient_all(job, told)
+    solved = solutions.solutions(job.table.pairs, job.cameras, oriented, job.units)
     texts = {} if options.out is None else files.texts(solved, job.units, job.summary(solved))
     write(job, texts)
     show(console, job, solved)
@@ -162,6 +166,8 @@ def tell(console: Console, job: Job, texts: dict[str, str]) -> None:
 def show(console: Console, job: Job, solved: list[Solution]) -> None:
     """The orientations on the terminal."""
     report.show(console, solved, job.units, f"{job.system_name} elements, {job.options.residual} residuals")
+    if len(solved) == 1:
+        reading.show(console, solved[0], job.units)
 
 
 def read_table(options: Options, otherwise: Example) -> tables.Table:
@@ -217,15 +223,15 @@ def _check_numbers(options: Options, table: tables.Table, system: type[AbstractE
             raise TableError("--base", None, None, repr(options.base), allowed)
 
 
-def orient_all(pairs: list[Pair], keywords: dict[str, Any], progress: Callable[[int], None]) -> list[Solved]:
+def orient_all(job: Job, progress: Callable[[int], None]) -> list[Solved]:
     """Every pair oriented, in order, as NumPy values; padding of many pairs is left in place.
 
     `progress` is told the number of pairs finished so far.
     """
     found = each(
-        pairs,
-        lambda pair: with_corrections(orient(pair, **keywords), pair),
-        lambda batch, told: with_corrections(orient_batch(batch, progress=told, **keywords), batch),
+        job.pairs,
+        lambda pair: job.read(orient(pair, **job.keywords), pair),
+        lambda batch, told: job.read(orient_batch(batch, progress=told, **job.keywords), batch),
         progress,
     )
     return [one for _, one in sorted(found, key=lambda entry: entry[0])]

@@ -32,14 +32,14 @@ def _one(console: Console, s: Solution, units: Units, subtitle: str) -> None:
     console.print(_cameras(s, units) + subtitle)
     console.print(_verdict(s))
     if s.usable:
-        elements = _table("element", "value", "± sd", "unit")
+        elements = table("element", "value", "± sd", "unit")
         for e in s.elements:
-            digits = _digits(e.deviation)
-            sd = "given" if e.deviation is None else _number(e.deviation, digits)
-            elements.add_row(e.name, _number(e.value, digits), sd, _unit(e.unit))
+            decimals = digits(e.deviation)
+            sd = "given" if e.deviation is None else number(e.deviation, decimals)
+            elements.add_row(e.name, number(e.value, decimals), sd, _unit(e.unit))
         console.print(elements)
-        sigma0 = f"sigma0 {_number(s.sigma0, _digits(s.sigma0))}" + (f" {units.sigma0}" if units.sigma0 else "")
-        m_q = f"m_q {_number(s.m_q, _digits(s.m_q))} {units.photo}"
+        sigma0 = f"sigma0 {number(s.sigma0, digits(s.sigma0))}" + (f" {units.sigma0}" if units.sigma0 else "")
+        m_q = f"m_q {number(s.m_q, digits(s.m_q))} {units.photo}"
         freedom = int(o.degrees_of_freedom)
         console.print(
             f"{sigma0}   {m_q}   {freedom} degree{'s' * (freedom != 1)} of freedom   {o.iterations} iterations"
@@ -56,16 +56,16 @@ def _points(console: Console, s: Solution, units: Units) -> None:
         return
     corrections = ("v_x_left", "v_y_left", "v_x_right", "v_y_right")
     heads = ("q", "v xl", "v yl", "v xr", "v yr", "r", "X", "Y", "Z")
-    table = _table("point", *(heads if s.usable else heads[:6]), title=_legend(s, units))
+    rows = table("point", *(heads if s.usable else heads[:6]), title=_legend(s, units))
     size = _rms(p["q"] for p in points)
-    photo = _digits(max(size, _rms(p[v] for p in points for v in corrections)), 1)
+    photo = digits(max(size, _rms(p[v] for p in points for v in corrections)), 1)
     model = max(0, min(6, 5 - math.floor(math.log10(_rms(p[a] for p in points for a in "XYZ") or 1.0)))) - 1
-    for p in _worst(points, lambda p: (p["in_front"], -abs(p["q"]))):
-        cells = [_number(p[key], photo) for key in ("q", *corrections)] + [_number(p["redundancy"], 2)]
-        cells += [_number(p[a], max(model, 0)) for a in "XYZ"] if s.usable else []
-        table.add_row(escape(p["point"]), *cells, style=None if p["in_front"] else "red")
-    console.print(table)
-    _left_out(console, len(points), "points, those with the largest |q| shown")
+    for p in worst(points, lambda p: (p["in_front"], -abs(p["q"]))):
+        cells = [number(p[key], photo) for key in ("q", *corrections)] + [number(p["redundancy"], 2)]
+        cells += [number(p[a], max(model, 0)) for a in "XYZ"] if s.usable else []
+        rows.add_row(escape(p["point"]), *cells, style=None if p["in_front"] else "red")
+    console.print(rows)
+    left_out(console, len(points), "points, those with the largest |q| shown")
     behind = [p["point"] for p in points if not p["in_front"]]
     if behind:
         names = ", ".join(map(escape, behind[:MOST_ROWS])) + (", ..." if len(behind) > MOST_ROWS else "")
@@ -84,14 +84,14 @@ def _many(console: Console, solved: list[Solution], units: Units, subtitle: str)
     elements = [e for e in solved[0].elements if e.deviation is not None]
     heads = [f"{e.name} [{_unit(e.unit)}]" if e.unit else e.name for e in elements]
     sigma0 = f"sigma0 [{units.sigma0}]" if units.sigma0 else "sigma0"
-    table = _table("pair", "points", *heads, sigma0, f"m_q [{units.photo}]", "result")
-    for s in _worst(solved, lambda s: (s.usable, -s.m_q if math.isfinite(s.m_q) else 0.0)):
-        values = [_number(e.value, 4) for e in s.elements if e.deviation is not None]
-        accuracy = [_number(x, _digits(x)) for x in (s.sigma0, s.m_q)]
+    rows = table("pair", "points", *heads, sigma0, f"m_q [{units.photo}]", "result")
+    for s in worst(solved, lambda s: (s.usable, -s.m_q if math.isfinite(s.m_q) else 0.0)):
+        values = [number(e.value, 4) for e in s.elements if e.deviation is not None]
+        accuracy = [number(x, digits(x)) for x in (s.sigma0, s.m_q)]
         style = None if not s.advice else "yellow" if s.usable else "red"
-        table.add_row(escape(s.measured.name), str(len(s.measured.points)), *values, *accuracy, s.result, style=style)
-    console.print(table)
-    _left_out(console, len(solved), "pairs, failed ones and those with the largest m_q shown")
+        rows.add_row(escape(s.measured.name), str(len(s.measured.points)), *values, *accuracy, s.result, style=style)
+    console.print(rows)
+    left_out(console, len(solved), "pairs, failed ones and those with the largest m_q shown")
     by_result: dict[str, list[Solution]] = defaultdict(list)
     for s in solved:
         if s.advice:
@@ -114,22 +114,24 @@ def _verdict(s: Solution) -> str:
     return f"[{colour}]{s.result}[/{colour}]: {s.advice}"
 
 
-def _table(first: str, *numbers: str, title: str | None = None) -> Table:
+def table(first: str, *numbers: str, title: str | None = None) -> Table:
+    """An empty table: names first, then numbers."""
     style = {"box": box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0), "title_justify": "left"}
-    table = Table(title=title and escape(title), **style)
-    table.add_column(first, no_wrap=True)
+    rows = Table(title=title and escape(title), **style)
+    rows.add_column(first, no_wrap=True)
     for head in numbers:
-        table.add_column(escape(head), justify="left" if head in ("unit", "result") else "right", no_wrap=True)
-    return table
+        rows.add_column(escape(head), justify="left" if head in ("unit", "result") else "right", no_wrap=True)
+    return rows
 
 
-def _worst(rows: list, key) -> list:
+def worst(rows: list, key) -> list:
     """At most MOST_ROWS rows, the worst by `key`, in their own order."""
     kept = {id(row) for row in sorted(rows, key=key)[:MOST_ROWS]}
     return [row for row in rows if id(row) in kept]
 
 
-def _left_out(console: Console, count: int, what: str) -> None:
+def left_out(console: Console, count: int, what: str) -> None:
+    """A line about rows that are not shown."""
     if count > MOST_ROWS:
         console.print(f"{MOST_ROWS} of {count} {what}; --out DIR writes all.")
 
@@ -138,7 +140,7 @@ def _unit(unit: str) -> str:
     return {"deg": "°", "base_units": "units of the base"}.get(unit, unit)
 
 
-def _digits(size: float | None, at_least: int = 4) -> int:
+def digits(size: float | None, at_least: int = 4) -> int:
     """Decimals that show two significant digits of `size`."""
     if not size or not math.isfinite(size):
         return 4
@@ -150,7 +152,12 @@ def _rms(values: Iterable[float]) -> float:
     return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
 
 
-def _number(value: float, digits: int) -> str:
+def number(value: float, decimals: int) -> str:
+    """The number, "-" where it does not exist."""
     if not math.isfinite(value):
         return "-"
-    return f"{value + 0.0:.{digits}f}".replace("-0." + "0" * digits, "0." + "0" * digits) if digits else f"{value:.0f}"
+    return (
+        f"{value + 0.0:.{decimals}f}".replace("-0." + "0" * decimals, "0." + "0" * decimals)
+        if decimals
+        else f"{value:.0f}"
+    )

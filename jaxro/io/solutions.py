@@ -16,6 +16,8 @@ from .. import rotations as rot
 from ..elements import DependentElements, RelativePose
 from ..orientation import Orientation
 from ..pairs import Camera, Coordinates, Pair
+from ..programs import FAST, QUICK, Program
+from ..reliability import Reliability, assess
 from ..results import RESULTS
 from .tables import Measurements
 
@@ -49,15 +51,33 @@ class Element:
 
 
 class Solved(NamedTuple):
-    """An orientation as it comes from the engine, with the corrections of the coordinates."""
+    """An orientation as it comes from the engine, the corrections of the coordinates, and its reliability if asked."""
 
     orientation: Orientation
     corrections: Coordinates
+    reading: Reliability | None
 
 
-def with_corrections(orientation: Orientation, pair: Pair) -> Solved:
-    """The orientation of a pair (or of a batch) with its corrections."""
-    return Solved(orientation, orientation.corrections(pair))
+def read(orientation: Orientation, pair: Pair, reliable: bool, sigma_known: bool) -> Solved:
+    """The orientation of a pair (or of a batch) with what is told of its points.
+
+    `reliable`: whether it is the minimum that reliability is defined for; `sigma_known`: whether pair.sigma are true
+    standard deviations.
+    """
+    reading = None
+    if reliable and (sigma_known or np.max(orientation.degrees_of_freedom, initial=0) > 1):  # else nothing is testable
+        options = {"sigma0": jnp.ones(()) if sigma_known else None}
+        one = jnp.ndim(orientation.sigma0) == 0
+        reading = Program(_assessed if one else _all_assessed, options, QUICK if one else FAST)((pair, orientation))
+    return Solved(orientation, orientation.corrections(pair), reading)
+
+
+def _assessed(read: tuple[Pair, Orientation], *, sigma0) -> Reliability:
+    return assess(*read, sigma0=sigma0)
+
+
+def _all_assessed(read: tuple[Pair, Orientation], *, sigma0) -> Reliability:
+    return jax.vmap(lambda pair, orientation: assess(pair, orientation, sigma0=sigma0))(*read)
 
 
 @dataclass(frozen=True)
@@ -68,6 +88,7 @@ class Solution:
     cameras: tuple[Camera, Camera]
     orientation: Orientation
     corrections: tuple[np.ndarray, ...]
+    reading: Reliability | None
     elements: list[Element]
 
     @cached_property
@@ -177,11 +198,11 @@ def solutions(
 ) -> list[Solution]:
     """One `Solution` a pair, the elements of unusable ones NaN."""
     out = []
-    shown = shown_elements([o for o, _ in found], units)
-    for m, c, (o, v), elements in zip(measured, cameras, found, shown, strict=True):
-        solution = Solution(m, c, o, v, elements)
+    shown = shown_elements([s.orientation for s in found], units)
+    for m, c, (o, v, r), elements in zip(measured, cameras, found, shown, strict=True):
+        solution = Solution(m, c, o, v, r, elements)
         if not solution.usable:
             blank = [Element(e.name, e.unit, np.nan, None if e.deviation is None else np.nan) for e in elements]
-            solution = Solution(m, c, o, v, blank)
+            solution = Solution(m, c, o, v, r, blank)
         out.append(solution)
     return out

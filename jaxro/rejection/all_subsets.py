@@ -9,13 +9,14 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .. import critical_values
+from ..conditions import Linear, linearised
 from ..normal_equations import SINGULAR, accumulate, cholesky, substitute
 from ..orientation import orient
 from ..pairs import Pair, cleaned
 from ..reductions import count, total
 from ..starts import AbstractStart, Vertical
 from .base import OUTCOMES, AbstractProcedure, Rejection, Round, began, ended, finished, independent, recorded
-from .robust import Linear, at, normalised, scaled, stepped
+from .robust import normalised, scaled, stepped
 
 
 class AllSubsets(AbstractProcedure):
@@ -48,10 +49,10 @@ class AllSubsets(AbstractProcedure):
             """Σ r² without these points."""
             use, pose = fixed.mask & ~omitted, begin
             for _ in range(self.iterations):
-                linear = at(fixed, pose)
+                linear = linearised(fixed, pose)
                 pose = stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
             allowed = (count(omitted & ~fixed.mask) == 0) & (used - count(omitted) >= self.least)
-            squares = total(jnp.where(use, at(fixed, pose).squares, 0.0))
+            squares = total(jnp.where(use, linearised(fixed, pose).squares, 0.0))
             return jnp.where(allowed & jnp.isfinite(squares), squares, jnp.inf)
 
         def best_of(carry, omitted):
@@ -59,7 +60,7 @@ class AllSubsets(AbstractProcedure):
             first = jnp.arange(len(squares)) == jnp.argmin(squares)
             return carry, (jnp.min(squares), jnp.any(first[:, None] & omitted, axis=0))
 
-        _, (squares, choices) = lax.scan(best_of, None, self._shortlists(fixed, at(fixed, begin), most))
+        _, (squares, choices) = lax.scan(best_of, None, self._shortlists(fixed, linearised(fixed, begin), most))
         value = lambda m: critical_values.chi_squared(self.level, jnp.maximum(m - 5, 1.0))
         passes = squares <= jnp.stack([critical_values.by_count(value, n, used - k) for k in range(most + 1)])
         fewest = (jnp.arange(most + 1) == jnp.argmax(passes)) & passes
@@ -88,7 +89,7 @@ class AllSubsets(AbstractProcedure):
     def _ended(self, pair: Pair, omitted: Bool[Array, "point"], found: Bool[Array, ""]) -> Rejection:
         use = pair.mask & ~omitted
         solved = orient(pair.with_mask(use), start=self.start(lax.stop_gradient(pair.with_mask(use))).pose)
-        w = jnp.where(pair.mask, normalised(at(pair, solved.pose), use), 0.0)
+        w = jnp.where(pair.mask, normalised(linearised(pair, solved.pose), use), 0.0)
         limit = critical_values.by_count(lambda m: critical_values.normal(self.level + 0 * m), 1, count(use) * 0)
         new = Round(w, limit, omitted & pair.mask, solved.parallax, independent(solved.pose))
         outcome = OUTCOMES.where(found, finished(pair), OUTCOMES.operator_needed)

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..conditions import linearised
 from ..elements import RelativePose
 from ..pairs import Pair, cleaned
 from ..starts import AbstractStart, Vertical
 from .base import Rejection
-from .robust import AbstractSearch, agreeing, at, in_single, judged, reweighted, scaled
+from .robust import AbstractSearch, agreeing, in_single, judged, reweighted, scaled
 
 
 class GraduatedNonConvexity(AbstractSearch):
@@ -31,7 +32,7 @@ class GraduatedNonConvexity(AbstractSearch):
         pair = scaled(cleaned(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)
         pose = self.search(fixed)
-        use = fixed.mask & (at(fixed, pose).squares <= self.limit**2)
+        use = fixed.mask & (linearised(fixed, pose).squares <= self.limit**2)
         return judged(pair, *agreeing(fixed, pose, use, self.limit, self.rounds), self.limit)
 
     def search(self, pair: Pair) -> RelativePose:

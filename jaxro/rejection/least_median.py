@@ -6,12 +6,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..conditions import linearised
 from ..elements import RelativePose, vertical
 from ..pairs import Pair, cleaned
 from ..reductions import count, total
 from .base import Rejection
 from .hypotheses import AbstractHypotheses, Newton, best, draws, moved_up, solutions, squares
-from .robust import AbstractSearch, Use, Values, at, judged, stepped
+from .robust import AbstractSearch, Use, Values, judged, stepped
 
 BITS = 2 ** np.arange(30, -1, -1, dtype=np.int32)
 """Of a positive number in single precision, the highest first."""
@@ -41,7 +42,7 @@ class LeastMedian(AbstractSearch):
         unit = 1.4826 * (1 + 5 / jnp.maximum(count(pair.mask) - 5, 1.0)) * jnp.sqrt(median)
         use = pair.mask & (squares(fixed, pose) <= (self.limit * unit) ** 2)
         for _ in range(self.rounds):
-            pose = stepped(pose, linear := at(fixed, pose), jnp.where(use, linear.weight, 0.0))
+            pose = stepped(pose, linear := linearised(fixed, pose), jnp.where(use, linear.weight, 0.0))
             after = squares(fixed, pose)
             unit = jnp.sqrt(total(jnp.where(use, after, 0.0)) / jnp.maximum(count(use) - 5, 1.0))
             use = pair.mask & (after <= (self.limit * unit) ** 2)

@@ -9,12 +9,13 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from .. import critical_values
+from ..conditions import linearised
 from ..elements import RelativePose, vertical
 from ..pairs import Pair, cleaned
 from ..reductions import count, total
 from .base import Rejection
 from .hypotheses import AbstractHypotheses, FivePoint, best, draws, moved_up, solutions, squares
-from .robust import AbstractSearch, agreeing, at, judged, scaled, stepped
+from .robust import AbstractSearch, agreeing, judged, scaled, stepped
 
 CERTAIN = 1e-12
 """No share of good subsets is taken as nearer to 0 or 1 than this."""
@@ -91,7 +92,7 @@ class Ransac(AbstractSearch):
 
         def step(k, pose):
             limit = self.limit * jnp.where(k < self.steps, self.margin, 1.0)
-            linear = at(pair, pose)
+            linear = linearised(pair, pose)
             return stepped(pose, linear, jnp.where(linear.squares <= limit**2, linear.weight, 0.0))
 
         return lax.fori_loop(0, self.steps + 1, step, pose)

@@ -10,6 +10,7 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
 
 from .. import critical_values
+from ..conditions import linearised
 from ..elements import RelativePose
 from ..pairs import Pair, cleaned
 from ..reductions import count, total
@@ -17,7 +18,7 @@ from .base import OUTCOMES, AbstractProcedure, Rejection
 from .graduated_non_convexity import GraduatedNonConvexity
 from .hypotheses import EightPoint, FivePoint, Newton
 from .ransac import Ransac
-from .robust import AbstractSearch, agreeing, at, in_front, judged, one_by_one, scaled
+from .robust import AbstractSearch, agreeing, in_front, judged, one_by_one, scaled
 
 
 class Recommended(AbstractProcedure):
@@ -87,7 +88,7 @@ class Recommended(AbstractProcedure):
 
     def _found(self, search: AbstractSearch, pair: Pair, limit: Float[Array, ""]):
         pose = search.search(pair)
-        use = pair.mask & (at(pair, pose).squares <= limit**2)
+        use = pair.mask & (linearised(pair, pose).squares <= limit**2)
         found = agreeing(pair, pose, use, limit, self.rounds)
         best, lowest, _ = one_by_one(pair, *found, limit, 2)
         # small errors do not stand out in a search: the points one by one, beginning with all of them
@@ -111,7 +112,7 @@ class Recommended(AbstractProcedure):
 
     def _accidents(self, pair: Pair, pose: RelativePose, use, limit) -> Float[Array, ""]:
         """Logarithm of the expected number."""
-        linear, mask = at(pair, pose), pair.mask
+        linear, mask = linearised(pair, pose), pair.mask
         use = use & (linear.squares <= limit**2) & in_front(pair, pose)
         n, k = count(mask), count(use)
         wrong = mask & ~use

@@ -5,12 +5,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..conditions import linearised
 from ..elements import RelativePose
 from ..losses import AbstractWeight, Tukey
 from ..pairs import Pair, cleaned
 from ..starts import AbstractStart, Vertical
 from .base import Rejection
-from .robust import AbstractSearch, Values, at, judged, normalised, scaled, stepped
+from .robust import AbstractSearch, Values, judged, normalised, scaled, stepped
 
 PLAIN = 2
 """Steps of least squares before the first reweighted one."""
@@ -36,7 +37,7 @@ class Reweighting(AbstractSearch):
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
         pose, share = self._solved(lax.stop_gradient(pair))
-        use = pair.mask & (normalised(at(lax.stop_gradient(pair), pose), share) <= self.limit)
+        use = pair.mask & (normalised(linearised(lax.stop_gradient(pair), pose), share) <= self.limit)
         return judged(pair, pose, use, self.limit)
 
     def search(self, pair: Pair) -> RelativePose:
@@ -52,7 +53,7 @@ class Reweighting(AbstractSearch):
 
         def turn(state):
             rounds, _, pose, share = state
-            linear = at(pair, pose)
+            linear = linearised(pair, pose)
             w = normalised(linear, share)
             new = jnp.where(pair.mask, self.function.weight(w * w), 0.0)
             share = jnp.where(rounds < PLAIN, share, new)

@@ -2,14 +2,13 @@
 
 import abc
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .. import coplanarity
-from ..adjustment import Residuals
+from ..conditions import Linear, linearised
 from ..elements import RelativePose
 from ..normal_equations import accumulate, cholesky, solve, substitute
 from ..orientation import orient
@@ -19,19 +18,6 @@ from .base import AbstractProcedure, Rejection, Round, began, ended, finished, i
 
 Values = Float[Array, "point"]
 Use = Bool[Array, "point"]
-
-
-class Linear(NamedTuple):
-    """The conditions of the points at a pose: g, the columns of dg/dx, weights 1/d (zero where masked)."""
-
-    g: Values
-    columns: list[Values]
-    weight: Values
-
-    @property
-    def squares(self) -> Values:
-        """(r / sigma)² of the points."""
-        return self.weight * self.g * self.g
 
 
 class AbstractSearch(AbstractProcedure):
@@ -45,7 +31,7 @@ class AbstractSearch(AbstractProcedure):
 def judged(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike) -> Rejection:
     """The verdict that only `use` are right, with the evidence |w| against the limit and the orientation of them."""
     solved = orient(pair.with_mask(use), start=pose)
-    w = jnp.where(pair.mask, normalised(at(pair, solved.pose), use), 0.0)
+    w = jnp.where(pair.mask, normalised(linearised(pair, solved.pose), use), 0.0)
     limit = jnp.asarray(limit, w.dtype)
     new = Round(w, limit, pair.mask & ~use, solved.parallax, independent(solved.pose))
     return ended(recorded(began(pair, 1), new), solved, finished(pair))
@@ -64,14 +50,6 @@ def scaled(pair: Pair, sigma: float | None) -> Pair:
     return Pair(*pair.coordinates, known, pair.mask, pair.focal_left, pair.focal_right)
 
 
-def at(pair: Pair, pose: RelativePose) -> Linear:
-    """The conditions of a pair linearised at a pose, whitened with its sigma."""
-    prepare, condition, observations, cofactor = coplanarity.rigorous(pair)
-    residuals = Residuals(prepare, condition, pose, observations, cofactor, pair.mask)
-    (g,), jacobian, weight = residuals.columns((jnp.zeros_like(pair.focal_left),) * 5)
-    return Linear(g, [column for (column,) in jacobian], weight[0])  # pyright: ignore[reportOptionalSubscript]
-
-
 def stepped(pose: RelativePose, linear: Linear, weight: Values, most: float = 0.3) -> RelativePose:
     """The pose after one Gauss-Newton step with these weights in place of those of `linear`, no component longer than
     `most` (rad)."""
@@ -88,7 +66,7 @@ def stepped(pose: RelativePose, linear: Linear, weight: Values, most: float = 0.
 
 def reweighted(pair: Pair, pose: RelativePose, weight: Callable[[Values], Values]) -> RelativePose:
     """One step with the weights `weight`((r / sigma)²)."""
-    linear = at(pair, pose)
+    linear = linearised(pair, pose)
     return stepped(pose, linear, linear.weight * weight(linear.squares))
 
 
@@ -127,9 +105,9 @@ def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds:
 
     def turn(_, state):
         pose, use = state
-        linear = at(pair, pose)
+        linear = linearised(pair, pose)
         pose = stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
-        return pose, pair.mask & (normalised(at(pair, pose), use) <= limit)
+        return pose, pair.mask & (normalised(linearised(pair, pose), use) <= limit)
 
     return jax.lax.fori_loop(0, rounds, turn, (pose, use))
 
@@ -143,19 +121,19 @@ def one_by_one(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, round
     cut = jnp.asarray(limit, pair.sigma.dtype) ** 2
 
     def solved(pose, use):
-        linear = at(pair, pose)
+        linear = linearised(pair, pose)
         return stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
 
     def turn(_, state):
         pose, use, _ = state
         pose = solved(pose, use)
-        gain = normalised(at(pair, pose), use) ** 2 - cut
+        gain = normalised(linearised(pair, pose), use) ** 2 - cut
         gain = jnp.where(pair.mask, jnp.where(use, gain, -gain), 0.0)
         best = jnp.max(gain)
         return pose, use ^ ((gain == best) & (best > 0)), best <= 0
 
     pose, use, rests = jax.lax.fori_loop(0, rounds, turn, (pose, use, count(use) < 0))
     pose = solved(pose, use)
-    squares = at(pair, pose).squares
+    squares = linearised(pair, pose).squares
     cost = jnp.sum(jnp.where(pair.mask, jnp.where(use, squares, cut), 0.0))
     return (pose, use), jnp.where(jnp.isfinite(cost), cost, jnp.inf), rests
