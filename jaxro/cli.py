@@ -42,7 +42,9 @@ def orient(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for elements.csv, residuals.csv, points.csv, summary.json.", metavar="DIR", show_default=False
+            help="Folder for elements.csv, residuals.csv, points.csv, reliability.csv, summary.json.",
+            metavar="DIR",
+            show_default=False,
         ),
     ] = None,
     force: given.Force = False,

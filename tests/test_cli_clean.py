@@ -23,6 +23,7 @@ FILES = {
     "elements.csv",
     "residuals.csv",
     "points.csv",
+    "reliability.csv",
     "summary.json",
 }
 FOCAL = ["--focal", str(mock_example.FOCAL)]
