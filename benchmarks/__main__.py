@@ -18,10 +18,10 @@ def machine() -> str:
 
 
 def main() -> int:
-    from . import engine, rejection
+    from . import engine, reading, rejection
     from .common import QUICK, Size
 
-    suites = engine.SUITES | rejection.SUITES
+    suites = engine.SUITES | rejection.SUITES | reading.SUITES
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few pairs, few repeats: does it run, roughly how fast")

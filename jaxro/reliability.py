@@ -135,7 +135,7 @@ class Reliability(eqx.Module):
 
     @property
     def _freedom(self) -> PerPair:
-        return self.degrees_of_freedom.astype(self.estimated.dtype)
+        return jnp.asarray(self.degrees_of_freedom).astype(jnp.asarray(self.estimated).dtype)  # of NumPy in reports
 
 
 def controllability(redundancy: ArrayLike) -> Int[Array, "..."]:

@@ -87,7 +87,7 @@ class Solution:
     measured: Measurements
     cameras: tuple[Camera, Camera]
     orientation: Orientation
-    corrections: tuple[np.ndarray, ...]
+    corrections: tuple[Any, ...]
     reading: Reliability | None
     elements: list[Element]
 

@@ -77,7 +77,7 @@ class AllSubsets(AbstractProcedure):
         lists = [jnp.zeros((self.shortlist, n), bool)]
         for k in range(1, most + 1):
             choices = np.array(list(combinations(range(n), k))).T
-            block = [[h[i, j] for j in choices[: row + 1]] for row, i in enumerate(choices)]
+            block = [[h[i, j] for j in choices[: row + 1]] for row, i in enumerate(choices)]  # pyright: ignore[reportIndexIssue]
             gain = _gain(block, [r[i] for i in choices])
             gain = jnp.where(sum((~pair.mask[i]).astype(gain.dtype) for i in choices) > 0, -jnp.inf, gain)
             _, best = lax.top_k(gain.astype(jnp.float32), min(self.shortlist, gain.shape[0]))

@@ -62,7 +62,7 @@ class Reweighting(AbstractSearch):
 
         full = pair.mask.astype(pair.sigma.dtype)
         _, _, pose, share = lax.while_loop(more, turn, (zero.astype(int), zero + jnp.inf, self.start(pair).pose, full))
-        return pose, share
+        return pose, share  # pyright: ignore[reportReturnType]
 
 
 def _distance(one: RelativePose, other: RelativePose) -> Float[Array, ""]:

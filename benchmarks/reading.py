@@ -1,0 +1,50 @@
+"""The suite of reading an adjustment: what reliability costs beside the orientation it is read from."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+import jaxro
+from jaxro import starts
+
+from .common import Size, pair_of, rate, ready
+from .metrics import Metric, median_seconds
+from .workload import aerial
+
+
+def _oriented(pair: jaxro.Pair) -> jaxro.Orientation:
+    return jaxro.orient(pair, start=starts.Vertical())
+
+
+def _read(pair: jaxro.Pair) -> tuple[jaxro.Orientation, jaxro.Reliability]:
+    orientation = _oriented(pair)
+    return orientation, jaxro.assess(pair, orientation, sigma0=0.01)
+
+
+def reading(size: Size) -> list[Metric]:
+    """Orientation alone, and with everything `assess` tells, of 10,000 pairs of 16 points on the whole machine."""
+    pairs = pair_of(aerial(10_000, 16))
+    calls = {
+        name: partial(ready, jaxro.map_batch, f, pairs) for name, f in (("orientation", _oriented), ("both", _read))
+    }
+    calls["orientation"]()
+    _, found = calls["both"]()
+    worst = float(np.max(np.abs(np.sum(np.asarray(found.redundancy), axis=1) - 11)))
+    if not worst <= 1e-9:
+        raise ArithmeticError(f"reading: the redundancy numbers of a pair add up to {worst:.1e} beside 11")
+    seconds = median_seconds(calls, size.repeats)
+    return [
+        rate("reading, 16 points: orientation", seconds["orientation"] / 10_000),
+        rate("reading, 16 points: orientation and reliability", seconds["both"] / 10_000),
+        Metric(
+            "reading, 16 points: reliability against the orientation",
+            seconds["both"] / seconds["orientation"] - 1,
+            "times",
+            "lower",
+            goal=1,
+        ),
+    ]
+
+
+SUITES: dict[str, Callable[[Size], list[Metric]]] = {"reading": reading}
