@@ -31,7 +31,10 @@ def pairs():
     return mixed()
 
 
-@pytest.mark.parametrize("options", [{}, {"threads": 1, "chunk": 16, "elements": DependentElements, "base": 1.0}])
+OTHERS = {"threads": 1, "chunk": 16, "elements": DependentElements, "base": 1.0}
+
+
+@pytest.mark.parametrize("options", [{}, pytest.param(OTHERS, marks=pytest.mark.slow)])
 def test_batch_equals_vmap(pairs, options):
     batch = jaxro.orient_batch(pairs, **options)
     single = {k: v for k, v in options.items() if k in ("elements", "base")}

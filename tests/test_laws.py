@@ -33,6 +33,19 @@ every_kind = pytest.mark.parametrize(
     [*((system, coplanarity.rigorous) for system in problems.SYSTEMS), (IndependentElements, coplanarity.parallax)],
     ids=lambda kind: kind.__name__,
 )
+heavy_kind = pytest.mark.parametrize(
+    ("system", "residual"),
+    [
+        (RelativePose, coplanarity.rigorous),
+        (IndependentElements, coplanarity.parallax),
+        *(
+            pytest.param(system, coplanarity.rigorous, marks=pytest.mark.slow)
+            for system in (IndependentElements, DependentElements)
+        ),
+    ],
+    ids=lambda kind: kind.__name__,
+)
+"""The same, half of them left out where each compiles programs of its own."""
 
 
 def oriented(measured, system=RelativePose, base=BASE, **keywords):
@@ -182,7 +195,7 @@ def test_jit_is_eager(system, residual):
     close(oriented(measured, system, residual=residual), eager, 1e-10)
 
 
-@every_kind
+@heavy_kind
 def test_vmap_is_a_loop(system, residual):
     pairs = [problems.tilted(seed=seed) for seed in range(4)]
     together = eqx.filter_vmap(lambda p: oriented(p, system, residual=residual))(stack(pairs))
@@ -193,7 +206,7 @@ def test_vmap_is_a_loop(system, residual):
         close(jax.tree.map(lambda leaf, i=i: leaf[i], batch), alone, 1e-9)
 
 
-@every_kind
+@heavy_kind
 def test_three_derivatives_agree(system, residual):
     """d elements / d measured coordinates: forward, reverse and finite differences, at residuals far from zero."""
     measured = problems.tilted(sigma=0.1)

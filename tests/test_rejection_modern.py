@@ -60,8 +60,15 @@ def differing(mask, expected):
     return np.mean(np.any(mask != np.array(expected), axis=1))
 
 
+OFTEN = losses.Huber, losses.IggThree
+
+
 @pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("function", WEIGHTS, ids=lambda function: type(function).__name__)
+@pytest.mark.parametrize(
+    "function",
+    [f if isinstance(f, OFTEN) else pytest.param(f, marks=pytest.mark.slow) for f in WEIGHTS],
+    ids=lambda function: type(function).__name__,
+)
 def test_reweighting_ends_where_numpy_does(function, count):
     """Both at a fixed point; where two are near each other rounding may choose."""
     measured, wrong = contaminated(count)
@@ -107,7 +114,11 @@ def test_median_without_sorting():
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("procedure", [Ransac(hypotheses=Newton()), LeastMedian()], ids=["ransac", "least median"])
+@pytest.mark.parametrize(
+    "procedure",
+    [pytest.param(Ransac(hypotheses=Newton()), marks=pytest.mark.slow), LeastMedian()],
+    ids=["ransac", "least median"],
+)
 def test_random_subsets_stand_two_fifths_of_forty_points_wrong(procedure):
     """The pose of the good points alone; the least median without knowing sigma."""
     pairs, points = 200, 40
