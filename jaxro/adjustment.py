@@ -190,6 +190,12 @@ def reweighted(loss: AbstractLoss | None, r: list[Array], weight: list[Array] | 
     return [w * loss.weight(w * entry**2) for w, entry in zip(weight, r, strict=True)]
 
 
+def root(square: Array, there: Bool[Array, "..."] | bool = True) -> Array:
+    """The square root, zero where the square is not positive or not `there`; with finite derivatives."""
+    positive = (square > 0) & there
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
 def together(entries: list) -> Float[Array, " group"] | Float[Array, "group m"]:
     """The m arrays of all groups as one."""
     return entries[0] if len(entries) == 1 else jnp.stack(entries, axis=1)
@@ -279,8 +285,6 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
     freedom = len(r) * count(residuals.mask).astype(int) - p
     checked = freedom > 0
     variance = squares / jnp.where(checked, freedom, 1).astype(r[0].dtype)
-    positive = variance > 0
-    root = jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1.0)), 0.0)
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)
     result = RESULTS.where(pivot < normal.SINGULAR, RESULTS.rank_deficient, result)
     return Adjustment(
@@ -289,7 +293,7 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
         normal.dense(q),
         together(white),
         together(redundancy),
-        jnp.where(checked, root, jnp.nan),
+        jnp.where(checked, root(variance), jnp.nan),
         pivot,
         freedom,
         iterations,

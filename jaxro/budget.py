@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
+from .adjustment import root
 from .orientation import orient
 from .pairs import Pair
-from .propagation import jacobian, root
+from .propagation import jacobian
 from .reductions import total
 from .sensitivity import Quantity, heights, run
 from .simulation import planted

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from . import coplanarity, rotations as rot
+from .adjustment import root
 from .conditions import Linear, Values
 from .elements import DependentElements, IndependentElements, RelativePose, convert
 from .normal_equations import accumulate
@@ -45,12 +46,6 @@ def effects(
         for slope, b in zip(by_coordinate, linear.gradient, strict=True)
     )
     return Effects([jnp.abs(dot(row, shift)) for row in rows], _on_m_q(pair, orientation, linear, shift, jump), height)
-
-
-def root(square: Array, there: Bool[Array, "..."] | bool = True) -> Array:
-    """The square root, zero where the square is not positive or not `there`; with finite derivatives."""
-    positive = (square > 0) & there
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
 def _of_parameters(orientation: Orientation):

@@ -24,11 +24,10 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from . import coplanarity, normal_equations as normal, rotations as rot
-from .adjustment import Adjustment, Residuals, read
+from .adjustment import Adjustment, Residuals, read, root
 from .elements import AbstractElements, DependentElements, vertical
 from .pairs import Pair
 from .programs import QUICK, Program, traced
-from .propagation import root
 from .reductions import total
 from .simulation import Layout, mock_pair
 

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import coplanarity, degeneracy, rotations as rot, starts
-from .adjustment import adjust
+from .adjustment import adjust, root
 from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
 from .losses import AbstractLoss
 from .normal_equations import GaussNewton
@@ -177,7 +177,7 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     freedom = adjustment.degrees_of_freedom
     checked = freedom > 0
     qq = total(parallax**2) / jnp.where(checked, freedom, 1).astype(parallax.dtype)
-    m_q = jnp.where(checked, jnp.where(qq > 0, jnp.sqrt(jnp.where(qq > 0, qq, 1.0)), 0.0), jnp.nan)
+    m_q = jnp.where(checked, root(qq), jnp.nan)
 
     result = adjustment.result
     fair = result == RESULTS.successful

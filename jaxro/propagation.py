@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .adjustment import Adjustment, moved
+from .adjustment import Adjustment, moved, root
 from .orientation import Orientation
 from .reductions import total
 
@@ -84,9 +84,3 @@ def propagate_adjusted(
     variance = jnp.asarray(solved.sigma0 if sigma0 is None else sigma0) ** 2
     origin = jnp.zeros(solved.cofactor.shape[-1], solved.cofactor.dtype)
     return propagate(lambda step: function(moved(found, tuple(step))), origin, variance * solved.cofactor)
-
-
-def root(square: Array) -> Array:
-    """Square root with a finite derivative at zero."""
-    positive = square > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)

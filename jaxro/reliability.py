@@ -27,8 +27,9 @@ from jax.scipy.special import betainc, gammainc, gammaincc, ndtr
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import critical_values as critical
+from .adjustment import root
 from .conditions import Linear, linearised
-from .external_reliability import effects, root
+from .external_reliability import effects
 from .normal_equations import accumulate, cholesky, substitute
 from .orientation import Orientation
 from .pairs import Coordinates, Pair, cleaned

@@ -82,3 +82,13 @@ def test_batches_from_two_threads_at_once(pairs):
         results = list(pool.map(lambda _: jaxro.orient_batch(pairs).pose.base, range(8)))
     for base in results:
         np.testing.assert_array_equal(base, expected)
+
+
+def test_any_function_of_a_pair(pairs):
+    """In pair order whatever the slabs, each by its own; the whole tree comes back."""
+    seen: list = []
+    spread = lambda pair: {"widest": jnp.max(pair.x_left) - jnp.min(pair.x_left), "used": pair.mask}
+    found = jaxro.map_batch(spread, pairs, chunk=4, progress=lambda done, total: seen.append((done, total)))
+    np.testing.assert_array_equal(found["widest"], np.ptp(np.asarray(pairs.x_left), axis=1))
+    np.testing.assert_array_equal(found["used"], pairs.mask)
+    assert seen[-1] == (len(pairs.x_left),) * 2
