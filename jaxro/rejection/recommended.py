@@ -32,9 +32,9 @@ class Recommended(AbstractProcedure):
     5. Random subsets solved by the five-point method: for what is left, such as plane scenes in any position.
 
     What is found is solved by least squares, and every point, in use or not, judged anew by its normalised residual
-    |w| at the familywise `level`, in turns: a good point that a search lost comes back. The same is done point by point
-    from all points, by which few and small errors are found best; that set is taken if it convinces, or if its
-    Σ r² + limit² (rejected) is the smaller.
+    |w| at the familywise `level`, in turns: a good point that a search lost comes back. Where no more
+    than `few` are out, the same is done point by point from all points, by which few and small errors are found best;
+    that set is taken if it rests and convinces, or if its Σ r² + limit² (rejected) is the smaller.
 
     How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) (u/(1-u))^(k-5) of such
     sets that agree by accident: p = limit / mean |r| of the rejected points is about the share of wrong points that
@@ -46,13 +46,14 @@ class Recommended(AbstractProcedure):
     sigma: float | None = None
     level: float = 0.001
     rounds: int = 10
+    few: int = 7
     wrong: float = 1 / 3
     searches: tuple[AbstractSearch, ...] = (
         GraduatedNonConvexity(),
         Ransac(hypotheses=Newton(), count=32, limit=5.0),
-        Ransac(hypotheses=EightPoint(), count=64, limit=5.0),
+        Ransac(hypotheses=EightPoint(), count=128, confidence=0.99, limit=5.0),
         Ransac(hypotheses=Newton(), count=1024, limit=5.0),
-        Ransac(hypotheses=FivePoint(), limit=5.0),
+        Ransac(hypotheses=FivePoint(), count=128, limit=5.0),
     )
     accidents: tuple[float, ...] = (1e-4, 1e-3, 1e-3, 0.05, 0.05)
 
@@ -90,9 +91,11 @@ class Recommended(AbstractProcedure):
         pose = search.search(pair)
         use = pair.mask & (linearised(pair, pose).squares <= limit**2)
         found = agreeing(pair, pose, use, limit, self.rounds)
-        best, lowest, _ = one_by_one(pair, *found, limit, 2)
-        # small errors do not stand out in a search: the points one by one, beginning with all of them
-        other, cost, rests = one_by_one(pair, pose, pair.mask, limit, self.rounds)
+        always = count(pair.mask) >= 0
+        best, lowest, _ = one_by_one(pair, *found, limit, 2, always)
+        # a few small errors do not stand out in a search: the points one by one, beginning with all of them
+        few = count(pair.mask & ~best[1]) <= self.few
+        other, cost, rests = one_by_one(pair, pose, pair.mask, limit, self.rounds, few)
         convinces = self._accidents(pair, *other, limit) <= math.log(self.accidents[0])
         first = rests & ((cost < lowest) | convinces)
         return jax.tree.map(lambda a, b: jnp.where(first, a, b), other, best)

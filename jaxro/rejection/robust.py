@@ -13,7 +13,7 @@ from ..elements import RelativePose
 from ..normal_equations import accumulate, cholesky, solve, substitute
 from ..orientation import orient
 from ..pairs import Pair
-from ..reductions import count
+from ..reductions import count, total
 from .base import AbstractProcedure, Rejection, Round, began, ended, finished, independent, recorded
 
 Values = Float[Array, "point"]
@@ -99,41 +99,52 @@ def in_front(pair: Pair, pose: RelativePose) -> Use:
 
 
 def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int) -> tuple[RelativePose, Use]:
-    """The pose of the points with |w| <= limit, found in turns: solve, judge every point anew."""
+    """The pose of the points with |w| <= limit, found in turns: solve, judge every point anew.
 
+    Ends when the points stay the same after two turns or more, at last after `rounds`.
+    """
     limit = jnp.asarray(limit, pair.sigma.dtype)
 
-    def turn(_, state):
-        pose, use = state
-        linear = linearised(pair, pose)
-        pose = stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
-        return pose, pair.mask & (normalised(linearised(pair, pose), use) <= limit)
+    def turn(state):
+        k, _, pose, use = state
+        pose = solved(pair, pose, use)
+        new = pair.mask & (normalised(linearised(pair, pose), use) <= limit)
+        return k + 1, (k == 0) | (count(new ^ use) > 0), pose, new
 
-    return jax.lax.fori_loop(0, rounds, turn, (pose, use))
+    return _while_needed(rounds, count(use) >= 0, turn, pose, use)[1:]
 
 
-def one_by_one(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int):
+def one_by_one(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int, wanted: Bool[Array, ""]):
     """(pose, points) near the least Σ (r/sigma)² over the points in use + limit² (points rejected), that sum, and
     whether it rests there.
 
     In each round the one point changes sides that lowers the sum most: out, by w² - limit², or in, by limit² - w².
+    Nothing happens, and nothing rests, where it is not `wanted`.
     """
     cut = jnp.asarray(limit, pair.sigma.dtype) ** 2
 
-    def solved(pose, use):
-        linear = linearised(pair, pose)
-        return stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
-
-    def turn(_, state):
-        pose, use, _ = state
-        pose = solved(pose, use)
+    def turn(state):
+        k, _, pose, use = state
+        pose = solved(pair, pose, use)
         gain = normalised(linearised(pair, pose), use) ** 2 - cut
         gain = jnp.where(pair.mask, jnp.where(use, gain, -gain), 0.0)
         best = jnp.max(gain)
-        return pose, use ^ ((gain == best) & (best > 0)), best <= 0
+        return k + 1, best > 0, pose, use ^ ((gain == best) & (best > 0))
 
-    pose, use, rests = jax.lax.fori_loop(0, rounds, turn, (pose, use, count(use) < 0))
-    pose = solved(pose, use)
+    going, pose, use = _while_needed(rounds, wanted, turn, pose, use)
+    pose = solved(pair, pose, use)
     squares = linearised(pair, pose).squares
-    cost = jnp.sum(jnp.where(pair.mask, jnp.where(use, squares, cut), 0.0))
-    return (pose, use), jnp.where(jnp.isfinite(cost), cost, jnp.inf), rests
+    cost = total(jnp.where(pair.mask, jnp.where(use, squares, cut), 0.0))
+    return (pose, use), jnp.where(jnp.isfinite(cost), cost, jnp.inf), wanted & ~going
+
+
+def solved(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
+    """One step of least squares on the points in use."""
+    linear = linearised(pair, pose)
+    return stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
+
+
+def _while_needed(rounds: int, needed: Bool[Array, ""], turn: Callable, pose: RelativePose, use: Use):
+    """(needed, pose, use) after turns (k, needed, pose, use) -> the same, while needed and at most `rounds`."""
+    start = (jnp.where(needed, 0, rounds), needed, pose, use)
+    return jax.lax.while_loop(lambda state: state[1] & (state[0] < rounds), turn, start)[1:]
