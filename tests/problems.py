@@ -11,6 +11,7 @@ import oracles
 
 import jaxro
 from jaxro import DependentElements, IndependentElements, Pair, RelativePose, pair, simulation
+from jaxro.experiments import dorozhinsky1971
 from jaxro.programs import QUICK
 
 orient = jaxro.orient
@@ -49,13 +50,8 @@ def table_1(points: int) -> Pair:
     return simulation.planted(flat, y_right=TABLE_1_ERRORS[:points])
 
 
-def table_2() -> Pair:
-    """The flat mock pair of table 2, eight points, errors at points 7 and 8."""
-    minutes = (12.79, 36.24, -19.22, 32.89, 46.01)
-    elements = IndependentElements(*(jnp.deg2rad(jnp.asarray(m) / 60) for m in minutes))
-    layout = simulation.standard_layout(8)
-    flat = simulation.mock_pair(layout, elements, focal=70.64, base=63.99, y_range=(64.07, 62.32))
-    return simulation.planted(flat, y_right=np.array([0, 0, 0, 0, 0, 0, 1.10, 1.20]))
+table_2 = dorozhinsky1971.table_2
+"""The flat mock pair of table 2, eight points, errors at points 7 and 8."""
 
 
 def tilted(sigma: float = 0.01, seed: int = 0) -> Pair:

@@ -16,7 +16,7 @@ from ..pairs import Pair, cleaned
 from ..reductions import count, total
 from ..starts import AbstractStart, Vertical
 from .base import OUTCOMES, AbstractProcedure, Rejection, Round, began, ended, finished, independent, recorded
-from .robust import normalised, scaled, stepped
+from .robust import improved, normalised, scaled
 
 
 class AllSubsets(AbstractProcedure):
@@ -41,7 +41,7 @@ class AllSubsets(AbstractProcedure):
         pair = scaled(cleaned(pair)[0], self.sigma)
         n = pair.x_left.shape[0]
         most = min(self.most, max(n - self.least, 0))
-        fixed = lax.stop_gradient(pair)
+        fixed = lax.stop_gradient(pair)  # a decision has no derivative
         used = count(fixed.mask)
         begin = orient(fixed, start=self.start(fixed).pose).pose
 
@@ -49,8 +49,7 @@ class AllSubsets(AbstractProcedure):
             """Σ r² without these points."""
             use, pose = fixed.mask & ~omitted, begin
             for _ in range(self.iterations):
-                linear = linearised(fixed, pose)
-                pose = stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
+                pose = improved(fixed, pose, use)
             allowed = (count(omitted & ~fixed.mask) == 0) & (used - count(omitted) >= self.least)
             squares = total(jnp.where(use, linearised(fixed, pose).squares, 0.0))
             return jnp.where(allowed & jnp.isfinite(squares), squares, jnp.inf)
@@ -88,6 +87,7 @@ class AllSubsets(AbstractProcedure):
 
     def _ended(self, pair: Pair, omitted: Bool[Array, "point"], found: Bool[Array, ""]) -> Rejection:
         use = pair.mask & ~omitted
+        # the optimum does not depend on where it is sought
         solved = orient(pair.with_mask(use), start=self.start(lax.stop_gradient(pair.with_mask(use))).pose)
         w = jnp.where(pair.mask, normalised(linearised(pair, solved.pose), use), 0.0)
         limit = critical_values.by_count(lambda m: critical_values.normal(self.level + 0 * m), 1, count(use) * 0)

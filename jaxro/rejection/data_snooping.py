@@ -32,7 +32,7 @@ class DataSnooping(AbstractProcedure):
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
-        pose = self.start(lax.stop_gradient(pair)).pose
+        pose = self.start(lax.stop_gradient(pair)).pose  # the optimum does not depend on where it is sought
 
         def judge(mask, history):
             solved = orient(pair.with_mask(mask), start=pose)

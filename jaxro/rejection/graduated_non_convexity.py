@@ -30,7 +30,7 @@ class GraduatedNonConvexity(AbstractSearch):
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
-        fixed = lax.stop_gradient(pair)
+        fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = self.search(fixed)
         use = fixed.mask & (linearised(fixed, pose).squares <= self.limit**2)
         return judged(pair, *agreeing(fixed, pose, use, self.limit, self.rounds), self.limit)

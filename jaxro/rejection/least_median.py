@@ -6,13 +6,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..conditions import linearised
 from ..elements import RelativePose, vertical
 from ..pairs import Pair, cleaned
 from ..reductions import count, total
 from .base import Rejection
 from .hypotheses import AbstractHypotheses, Newton, best, draws, moved_up, solutions, squares
-from .robust import AbstractSearch, Use, Values, judged, stepped
+from .robust import AbstractSearch, Use, Values, improved, judged
 
 BITS = 2 ** np.arange(30, -1, -1, dtype=np.int32)
 """Of a positive number in single precision, the highest first."""
@@ -37,12 +36,12 @@ class LeastMedian(AbstractSearch):
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = cleaned(pair)[0]
-        fixed = lax.stop_gradient(pair)
+        fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose, median = self._found(fixed)
         unit = 1.4826 * (1 + 5 / jnp.maximum(count(pair.mask) - 5, 1.0)) * jnp.sqrt(median)
         use = pair.mask & (squares(fixed, pose) <= (self.limit * unit) ** 2)
         for _ in range(self.rounds):
-            pose = stepped(pose, linear := linearised(fixed, pose), jnp.where(use, linear.weight, 0.0))
+            pose = improved(fixed, pose, use)
             after = squares(fixed, pose)
             unit = jnp.sqrt(total(jnp.where(use, after, 0.0)) / jnp.maximum(count(use) - 5, 1.0))
             use = pair.mask & (after <= (self.limit * unit) ** 2)

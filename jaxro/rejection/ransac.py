@@ -55,7 +55,7 @@ class Ransac(AbstractSearch):
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
-        fixed = lax.stop_gradient(pair)
+        fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = self.search(fixed)
         each = lambda n: critical_values.normal(self.level / jnp.maximum(n, 1.0))
         critical = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))

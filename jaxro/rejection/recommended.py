@@ -32,9 +32,9 @@ class Recommended(AbstractProcedure):
     5. Random subsets solved by the five-point method: for what is left, such as plane scenes in any position.
 
     What is found is solved by least squares, and every point, in use or not, judged anew by its normalised residual
-    |w| at the familywise `level`, in turns: a good point that a search lost comes back. Where no more
-    than `few` are out, the same is done point by point from all points, by which few and small errors are found best;
-    that set is taken if it rests and convinces, or if its Σ r² + limit² (rejected) is the smaller.
+    |w| at the familywise `level`, in turns: a good point that a search lost comes back. Where no more than `few` are
+    out, the same is done point by point from all points, by which few and small errors are found best; that set is
+    taken if it rests, and convinces or has the smaller Σ r² + limit² (rejected).
 
     How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) (u/(1-u))^(k-5) of such
     sets that agree by accident: p = limit / mean |r| of the rejected points is about the share of wrong points that
@@ -59,7 +59,7 @@ class Recommended(AbstractProcedure):
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
-        fixed = lax.stop_gradient(pair)
+        fixed = lax.stop_gradient(pair)  # a decision has no derivative
         limit = critical_values.by_count(
             lambda n: critical_values.normal(self.level / jnp.maximum(n, 1.0)), pair.x_left.shape[0], count(pair.mask)
         )
@@ -91,8 +91,7 @@ class Recommended(AbstractProcedure):
         pose = search.search(pair)
         use = pair.mask & (linearised(pair, pose).squares <= limit**2)
         found = agreeing(pair, pose, use, limit, self.rounds)
-        always = count(pair.mask) >= 0
-        best, lowest, _ = one_by_one(pair, *found, limit, 2, always)
+        best, lowest, _ = one_by_one(pair, *found, limit, 2)
         # a few small errors do not stand out in a search: the points one by one, beginning with all of them
         few = count(pair.mask & ~best[1]) <= self.few
         other, cost, rests = one_by_one(pair, pose, pair.mask, limit, self.rounds, few)

@@ -36,8 +36,9 @@ class Reweighting(AbstractSearch):
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
-        pose, share = self._solved(lax.stop_gradient(pair))
-        use = pair.mask & (normalised(linearised(lax.stop_gradient(pair), pose), share) <= self.limit)
+        fixed = lax.stop_gradient(pair)  # a decision has no derivative
+        pose, share = self._solved(fixed)
+        use = pair.mask & (normalised(linearised(fixed, pose), share) <= self.limit)
         return judged(pair, pose, use, self.limit)
 
     def search(self, pair: Pair) -> RelativePose:

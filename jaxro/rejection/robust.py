@@ -107,44 +107,46 @@ def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds:
 
     def turn(state):
         k, _, pose, use = state
-        pose = solved(pair, pose, use)
+        pose = improved(pair, pose, use)
         new = pair.mask & (normalised(linearised(pair, pose), use) <= limit)
         return k + 1, (k == 0) | (count(new ^ use) > 0), pose, new
 
-    return _while_needed(rounds, count(use) >= 0, turn, pose, use)[1:]
+    return _while_needed(rounds, jnp.asarray(True), turn, pose, use)[1:]
 
 
-def one_by_one(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int, wanted: Bool[Array, ""]):
+def one_by_one(
+    pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int, wanted: Bool[Array, ""] | bool = True
+):
     """(pose, points) near the least Σ (r/sigma)² over the points in use + limit² (points rejected), that sum, and
     whether it rests there.
 
     In each round the one point changes sides that lowers the sum most: out, by w² - limit², or in, by limit² - w².
     Nothing happens, and nothing rests, where it is not `wanted`.
     """
-    cut = jnp.asarray(limit, pair.sigma.dtype) ** 2
+    cut, wanted = jnp.asarray(limit, pair.sigma.dtype) ** 2, jnp.asarray(wanted)
 
     def turn(state):
         k, _, pose, use = state
-        pose = solved(pair, pose, use)
+        pose = improved(pair, pose, use)
         gain = normalised(linearised(pair, pose), use) ** 2 - cut
         gain = jnp.where(pair.mask, jnp.where(use, gain, -gain), 0.0)
         best = jnp.max(gain)
         return k + 1, best > 0, pose, use ^ ((gain == best) & (best > 0))
 
     going, pose, use = _while_needed(rounds, wanted, turn, pose, use)
-    pose = solved(pair, pose, use)
+    pose = improved(pair, pose, use)
     squares = linearised(pair, pose).squares
     cost = total(jnp.where(pair.mask, jnp.where(use, squares, cut), 0.0))
     return (pose, use), jnp.where(jnp.isfinite(cost), cost, jnp.inf), wanted & ~going
 
 
-def solved(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
-    """One step of least squares on the points in use."""
+def improved(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
+    """The pose after one step of least squares on the points in use."""
     linear = linearised(pair, pose)
     return stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
 
 
 def _while_needed(rounds: int, needed: Bool[Array, ""], turn: Callable, pose: RelativePose, use: Use):
     """(needed, pose, use) after turns (k, needed, pose, use) -> the same, while needed and at most `rounds`."""
-    start = (jnp.where(needed, 0, rounds), needed, pose, use)
+    start = (jnp.zeros((), int), needed, pose, use)
     return jax.lax.while_loop(lambda state: state[1] & (state[0] < rounds), turn, start)[1:]
