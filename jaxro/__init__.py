@@ -48,6 +48,12 @@ from .pairs import (
     swapped as swapped,
     unstack as unstack,
 )
+from .ragged import (
+    Ragged as Ragged,
+    clean_ragged as clean_ragged,
+    join as join,
+    orient_ragged as orient_ragged,
+)
 from .reliability import Reliability as Reliability, assess as assess
 from .results import RESULTS as RESULTS, is_usable as is_usable
 

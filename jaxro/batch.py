@@ -8,9 +8,9 @@ so that they do not hold up their chunk.
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,11 +41,37 @@ def _everything(result: Any) -> Any:
     return result
 
 
+class Selected(NamedTuple):
+    """What is kept of (pair, orientation) where the pair does not matter."""
+
+    select: Callable[[Orientation], PyTree]
+
+    def __call__(self, pair: Pair, orientation: Orientation) -> PyTree:
+        """What is kept."""
+        return self.select(orientation)
+
+
+class Way(NamedTuple):
+    """How pairs go through: threads (all cores), pairs per chunk (by the number of points), and pairs per call of the
+    program (by the number of pairs; given, all calls have one shape), each as it is best where it is None."""
+
+    threads: int | None = None
+    chunk: int | None = None
+    slab: int | None = None
+
+
+Report = Callable[[int, int], None]
+
+
+def unheard(done: int, total: int) -> None:
+    """Progress that nobody asked for."""
+
+
 def orient_batch(
     pairs: Pair,
     *,
     select: Callable[[Orientation], PyTree] = _everything,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Report | None = None,
     threads: int | None = None,
     chunk: int | None = None,
     start: AbstractStart | Any = Auto(),  # noqa: B008 (frozen)
@@ -57,23 +83,40 @@ def orient_batch(
     `progress(done, total)` is called from the calling thread. Other keywords are those of `orient`. The results are
     those of `orient` one by one, to rounding.
     """
-    chunk = _chunk(pairs, chunk)
-    if options.get("base") is not None:
-        options["base"] = jnp.asarray(options["base"], pairs.x_left.dtype)  # an argument: no program for each value
-    options = options | {"select": select, "chunk": chunk}
-    settings = _settings(pairs)
-    host = jax.tree.map(np.asarray, pairs)
-    report = progress or (lambda done, total: None)
+    host, report, way = jax.tree.map(np.asarray, pairs), progress or unheard, Way(threads, chunk)
+    options = settled(pairs.x_left.dtype, options) | {"read": Selected(select)}
     if not isinstance(start, Auto):
-        return _finish(_spread(host, Program(_slab, options | {"start": start}, settings), threads, chunk, report))
-    out, fits = _spread(host, Program(_slab_near, options | {"start": start}, settings), threads, chunk, report)
+        return _finish(oriented(host, options | {"start": start}, way, report))
+    out, fits = oriented_near(host, options | {"start": start}, way, report)
     rest = np.flatnonzero(~fits)
     if rest.size:
-        left_over = jax.tree.map(lambda a: a[rest], host)
-        general = Program(_slab, options | {"start": start.general})
-        again = _spread(left_over, general, threads, chunk, lambda done, total: None)
+        again = oriented(jax.tree.map(lambda a: a[rest], host), options | {"start": start.general}, way, unheard)
         _replace(out, rest, again)
     return _finish(out)
+
+
+def settled(dtype: Any, options: dict[str, Any]) -> dict[str, Any]:
+    """The options of `orient`, a given base as an array: an argument, no program for each value."""
+    if options.get("base") is None:
+        return options
+    return options | {"base": jnp.asarray(options["base"], dtype)}
+
+
+def oriented(pairs: Pair, options: dict[str, Any], way: Way = Way(), report: Report = unheard) -> PyTree:  # noqa: B008
+    """read(pair, orientation) of every pair, in NumPy; `options`: read, start, and those of `orient`."""
+    chunk = _chunk(pairs, way.chunk)
+    return _spread(pairs, Program(_slab, options | {"chunk": chunk}, _settings(pairs)), way, chunk, report)
+
+
+def oriented_near(
+    pairs: Pair,
+    options: dict[str, Any],
+    way: Way = Way(),  # noqa: B008 (frozen)
+    report: Report = unheard,
+) -> tuple[PyTree, np.ndarray]:
+    """The same from the vertical, and for which pairs that fits; `options["start"]` is an `Auto`."""
+    chunk = _chunk(pairs, way.chunk)
+    return _spread(pairs, Program(_slab_near, options | {"chunk": chunk}, _settings(pairs)), way, chunk, report)
 
 
 def _replace(out: PyTree, rows: np.ndarray, new: PyTree) -> None:
@@ -86,7 +129,7 @@ def clean_batch(
     procedure: AbstractProcedure,
     *,
     select: Callable[[Rejection], PyTree] = _everything,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Report | None = None,
     threads: int | None = None,
     chunk: int | None = None,
 ) -> PyTree:
@@ -94,35 +137,40 @@ def clean_batch(
 
     `select=lambda r: r.mask` computes no log and no statistics that the decision does not need.
     """
-    given, usual = chunk, _chunk(pairs, chunk)
-    host = jax.tree.map(np.asarray, pairs)
-    report = progress or (lambda done, total: None)
-
-    def run(pairs: Pair, procedure: AbstractProcedure, report: Callable) -> tuple[PyTree, np.ndarray]:
-        # a search has many subsets of each pair in work, and goes on until the last pair of its chunk is served
-        searches = _by_subsets(procedure)
-        chunk = min(usual, SEARCHED) if searches and given is None else usual
-        program = Program(_slab_cleaned, {"procedure": procedure, "select": select, "chunk": chunk}, _settings(pairs))
-        return _spread(pairs, program, threads, chunk, report)
-
-    if not isinstance(procedure, Recommended):
-        return _finish(run(host, procedure, report)[0])
-    first, *others = procedure.stages()
-    out, again = run(host, first, report)
+    host, report, way = jax.tree.map(np.asarray, pairs), progress or unheard, Way(threads, chunk)
+    first, *others = stages(procedure)
+    out, again = decided(host, first, select, way, report)
     for stage in others:
         rest = np.flatnonzero(again)
         if rest.size:
-            new, doubtful = run(jax.tree.map(lambda a, rest=rest: a[rest], host), stage, lambda done, total: None)
+            new, doubtful = decided(jax.tree.map(lambda a, rest=rest: a[rest], host), stage, select, way, unheard)
             _replace(out, rest, new)
             again[rest] = doubtful
     return _finish(out)
+
+
+def stages(procedure: AbstractProcedure) -> Sequence[AbstractProcedure]:
+    """The procedures to be tried in turn, each on the pairs that the one before left in doubt."""
+    return procedure.stages() if isinstance(procedure, Recommended) else (procedure,)
+
+
+def decided(
+    pairs: Pair, procedure: AbstractProcedure, select: Callable[[Rejection], PyTree], way: Way, report: Report
+) -> tuple[PyTree, np.ndarray]:
+    """What is selected of every pair's rejection, in NumPy, and for which pairs the procedure was in doubt."""
+    chunk = _chunk(pairs, way.chunk)
+    # a search has many subsets of each pair in work, and goes on until the last pair of its chunk is served
+    if _by_subsets(procedure) and way.chunk is None:
+        chunk = min(chunk, SEARCHED)
+    program = Program(_slab_cleaned, {"procedure": procedure, "select": select, "chunk": chunk}, _settings(pairs))
+    return _spread(pairs, program, way, chunk, report)
 
 
 def map_batch(
     function: Callable[[Pair], PyTree],
     pairs: Pair,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Report | None = None,
     threads: int | None = None,
     chunk: int | None = None,
 ) -> PyTree:
@@ -133,8 +181,8 @@ def map_batch(
     """
     chunk = _chunk(pairs, chunk)
     program = Program(_slab_mapped, {"function": function, "chunk": chunk}, _settings(pairs))
-    report = progress or (lambda done, total: None)
-    return _finish(_spread(jax.tree.map(np.asarray, pairs), program, threads, chunk, report))
+    host, way = jax.tree.map(np.asarray, pairs), Way(threads, chunk)
+    return _finish(_spread(host, program, way, chunk, progress or unheard))
 
 
 def _by_subsets(procedure: AbstractProcedure) -> bool:
@@ -163,18 +211,18 @@ def _chunked(one: Callable, pairs: Pair, chunk: int) -> PyTree:
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), jax.lax.map(jax.vmap(one), split))
 
 
-def _slab(pairs: Pair, *, select: Callable, chunk: int, **options) -> PyTree:
-    return _chunked(lambda pair: select(orient(pair, **options)), pairs, chunk)
+def _slab(pairs: Pair, *, read: Callable, chunk: int, **options) -> PyTree:
+    return _chunked(lambda pair: read(pair, orient(pair, **options)), pairs, chunk)
 
 
 def _slab_mapped(pairs: Pair, *, function: Callable, chunk: int) -> PyTree:
     return _chunked(function, pairs, chunk)
 
 
-def _slab_near(pairs: Pair, *, select: Callable, chunk: int, start: Auto, **options) -> tuple[PyTree, Array]:
+def _slab_near(pairs: Pair, *, read: Callable, chunk: int, start: Auto, **options) -> tuple[PyTree, Array]:
     def one(pair: Pair):
         orientation, fits = orient_near(pair, start=start, **options)
-        return select(orientation), fits
+        return read(pair, orientation), fits
 
     return _chunked(one, pairs, chunk)
 
@@ -189,11 +237,13 @@ def _slab_cleaned(pairs: Pair, *, procedure: AbstractProcedure, select: Callable
     return _chunked(one, pairs, chunk)
 
 
-def _spread(pairs: Pair, run: Program, threads: int | None, chunk: int, report: Callable) -> PyTree:
+def _spread(pairs: Pair, run: Program, way: Way, chunk: int, report: Report) -> PyTree:
     """All slabs through the program, as NumPy arrays."""
     total = pairs.x_left.shape[0]
-    workers = threads or len(os.sched_getaffinity(0))
-    if total <= chunk:
+    workers = way.threads or len(os.sched_getaffinity(0))
+    if way.slab is not None:
+        size = -(-way.slab // chunk) * chunk
+    elif total <= chunk:
         size = 1 << max(total - 1, 0).bit_length()
     else:
         most = max(1, SLAB_POINTS // (chunk * max(pairs.x_left.shape[1], 1)))

@@ -14,7 +14,7 @@ except ModuleNotFoundError:
 
 from .experiments import REPRODUCTIONS
 from .io import arguments as given
-from .io.arguments import Residual
+from .io.arguments import Engine, Residual
 from .io.tables import TableError
 from .rejection import PROCEDURES
 
@@ -48,6 +48,10 @@ def orient(
         ),
     ] = None,
     force: given.Force = False,
+    tables: given.Tables = None,
+    resume: given.Resume = False,
+    parquet: given.Parquet = False,
+    engine: given.Where = Engine.local,
 ) -> None:
     """Orient every pair of FILE: elements with standard deviations, y-parallaxes, m_q, model points.
 
@@ -58,7 +62,12 @@ def orient(
     options = Options(
         file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
     )
-    _end(lambda: run(options))
+    if given.large(file, parquet, resume):
+        from .io import large
+
+        _end(lambda: large.run(options, large.Large(tables, resume, engine=_engine(engine))))
+    else:
+        _end(lambda: run(options))
 
 
 @app.command()
@@ -96,19 +105,30 @@ def clean(
         ),
     ] = None,
     force: given.Force = False,
+    tables: given.Tables = None,
+    resume: given.Resume = False,
+    parquet: given.Parquet = False,
+    engine: given.Where = Engine.local,
 ) -> None:
     """Find the wrong points of every pair of FILE.
 
     Which, in what order, on what evidence; and the orientation of the points kept.
     Exit code 0: all cleaned and usable; 1: some pair not; 2: bad input, nothing written.
     """
-    from .io.cleaning import DEFAULT, run
+    from .io.cleaning import DEFAULT, chosen, run
     from .io.job import Options
 
     options = Options(
         file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
     )
-    _end(lambda: run(options, procedure or DEFAULT, tolerance or []))
+    name, changes = procedure or DEFAULT, tolerance or []
+    if given.large(file, parquet, resume):
+        from .io import large
+
+        how = large.Large(tables, resume, engine=_engine(engine))
+        _end(lambda: large.run(options, how, chosen(name, changes)))
+    else:
+        _end(lambda: run(options, name, changes))
 
 
 @app.command()
@@ -179,6 +199,13 @@ def reproduce(
     from .io import simulating
 
     _end(lambda: simulating.reproduce(name, trials, seed))
+
+
+def _engine(name: Engine) -> Callable:
+    from .distributed import on_ray
+    from .io.streaming import here
+
+    return {Engine.local: here, Engine.ray: on_ray}[name]
 
 
 def _end(work: Callable[[], bool]) -> None:

@@ -22,6 +22,13 @@ class Residual(enum.StrEnum):
     parallax = "parallax"
 
 
+class Engine(enum.StrEnum):
+    """Where tables of any size are worked on, by the names of the command line."""
+
+    local = "local"
+    ray = "ray"
+
+
 COLUMNS = (
     "CSV table with the columns point,x_left,y_left,x_right,y_right (or id,xl,yl,xr,yr) and optionally pair, sigma."
 )
@@ -86,3 +93,25 @@ Minimised = Annotated[Residual, typer.Option(help="What is minimised: whitened c
 Unit = Annotated[str, typer.Option(help="Name of the photo unit in reports: mm, px.", metavar="NAME")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite the files in a folder that is not empty.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.", metavar="S")]
+Tables = Annotated[
+    str | None,
+    typer.Option(
+        help="Of Parquet results: some of elements,residuals,points,reliability.  [default: the first three]",
+        metavar="NAME,...",
+        show_default=False,
+    ),
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with a run of Parquet results that was stopped.")]
+Parquet = Annotated[
+    bool,
+    typer.Option(
+        "--parquet",
+        help="Results as Parquet tables, part by part: any number of pairs, bounded memory. Always for FILE.parquet.",
+    ),
+]
+Where = Annotated[Engine, typer.Option(help="Where Parquet results are worked on: here, or on a Ray cluster.")]
+
+
+def large(file: Path | None, parquet: bool, resume: bool) -> bool:
+    """Whether the results are Parquet tables, part by part."""
+    return parquet or resume or (file is not None and file.suffix == ".parquet")

@@ -62,6 +62,11 @@ def run(options: Options, name: str, changes: list[str]) -> bool:
     return all(v.finished and s.usable for v, s in zip(verdicts, solved, strict=True))
 
 
+def chosen(name: str, changes: list[str]) -> tuple[str, AbstractProcedure]:
+    """The procedure with its changed tolerances, by its name. Raises TableError."""
+    return name, changed(named(name), changes)
+
+
 def named(name: str) -> AbstractProcedure:
     """The procedure of this name. Raises TableError."""
     if name not in PROCEDURES:

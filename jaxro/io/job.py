@@ -114,18 +114,23 @@ def prepared(options: Options, otherwise: Example = MEASURED) -> Job:
         files.check_target(options.out, options.force)
     system = SYSTEMS[options.elements or ("relative" if options.file else "dependent")]
     table = read_table(options, otherwise)
-    cameras = read_cameras(options, table, otherwise)
-    _check_numbers(options, table, system)
+    known = read_cameras(options, otherwise)
+    cameras = [known.of(measured, table.file) for measured in table.pairs]
+    check_numbers(options, table.has_sigma, table.file, system)
     pairs = [
         camera_files.to_pair(measured, table.file, *both, options.sigma)
         for measured, both in zip(table.pairs, cameras, strict=True)
     ]
-    units = Units(
+    return Job(options, table, cameras, pairs, system, units_of(options, table.has_sigma, system))
+
+
+def units_of(options: Options, has_sigma: bool, system: type[AbstractElements]) -> Units:
+    """The units of all that is reported."""
+    return Units(
         photo=options.unit,
         model="bases" if system is RelativePose else options.unit if options.base is None else "base_units",
-        sigma0="" if table.has_sigma or options.sigma is not None else options.unit,
+        sigma0="" if has_sigma or options.sigma is not None else options.unit,
     )
-    return Job(options, table, cameras, pairs, system, units)
 
 
 def run(options: Options) -> bool:
@@ -177,8 +182,8 @@ def read_table(options: Options, otherwise: Example) -> tables.Table:
     return tables.read(options.file)
 
 
-def read_cameras(options: Options, table: tables.Table, otherwise: Example) -> list[tuple[Camera, Camera]]:
-    """(left, right) camera of every pair, from --camera or from the single options."""
+def read_cameras(options: Options, otherwise: Example) -> camera_files.Cameras:
+    """The cameras of --camera, or the one of the single options."""
     single = {
         "--focal": options.focal,
         "--principal-point": options.principal_point,
@@ -189,8 +194,7 @@ def read_cameras(options: Options, table: tables.Table, otherwise: Example) -> l
         for name, value in single.items():
             if value is not None:
                 raise TableError(name, None, None, "it beside --camera", f"this entry in {options.camera} instead")
-        known = camera_files.read(options.camera)
-        return [known.of(measured, table.file) for measured in table.pairs]
+        return camera_files.read(options.camera)
     focal = otherwise.focal if options.file is None and options.focal is None else options.focal
     if focal is None:
         expected = f"the focal length of the photos, --focal {otherwise.focal} or --camera camera.toml"
@@ -203,15 +207,14 @@ def read_cameras(options: Options, table: tables.Table, otherwise: Example) -> l
         raise TableError("--principal-point", None, None, repr(centre), "two numbers")
     pixel_size = 1.0 if options.pixel_size is None else options.pixel_size
     one = Camera(focal, centre, pixel_size, options.y_down)
-    return [(one, one)] * len(table.pairs)
+    return camera_files.Cameras("--focal", one, one)
 
 
-def _check_numbers(options: Options, table: tables.Table, system: type[AbstractElements]) -> None:
+def check_numbers(options: Options, has_sigma: bool, file: str, system: type[AbstractElements]) -> None:
+    """Raises TableError for a sigma or base that cannot be."""
     if options.sigma is not None:
-        if table.has_sigma:
-            raise TableError(
-                "--sigma", None, None, f"it beside the column sigma of {table.file}", "only one of the two"
-            )
+        if has_sigma:
+            raise TableError("--sigma", None, None, f"it beside the column sigma of {file}", "only one of the two")
         if not (math.isfinite(options.sigma) and options.sigma > 0):
             raise TableError("--sigma", None, None, repr(options.sigma), "a positive standard deviation")
     if options.base is not None:

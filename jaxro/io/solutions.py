@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .. import rotations as rot
-from ..elements import DependentElements, RelativePose
+from ..adjustment import root
+from ..elements import AbstractElements, DependentElements, RelativePose
 from ..orientation import Orientation
 from ..pairs import Camera, Coordinates, Pair
 from ..programs import FAST, QUICK, Program
@@ -147,47 +149,63 @@ class Solution:
         }
 
 
-@jax.jit
-@jax.vmap
-def _angles_and_base(pose: RelativePose, covariance):
-    """(bx, by, bz, omega, phi, kappa) of poses and their standard deviations, sqrt(diag(J C Jᵀ))."""
+def element_values(found: AbstractElements, cofactor: Array, sigma0: Array) -> tuple[list[Array], list[Array]]:
+    """The numbers that are reported of elements and their standard deviations: angles in degrees.
 
-    def values(step):
-        rotation, base = pose.moved(tuple(step)).relative()
-        return jnp.stack([*base, *rot.omega_phi_kappa(rot.transpose(rotation))])
+    Of a `RelativePose`: the unit base vector and the angles of M = R3(kappa) R2(phi) R1(omega), with
+    sqrt(diag(J C Jᵀ)). Of `DependentElements` bx first, which is given: deviation 0.
+    """
+    degrees = lambda numbers, angles: [jnp.rad2deg(n) if angle else n for n, angle in zip(numbers, angles, strict=True)]
+    if not isinstance(found, RelativePose):
+        bx = [found.bx] if isinstance(found, DependentElements) else []
+        angles, zero = (False,) * len(bx) + found.angles, [jnp.zeros_like(sigma0)] * len(bx)
+        deviations = [sigma0 * root(cofactor[i, i]) for i in range(5)]
+        return degrees([*bx, *found.values()], angles), degrees([*zero, *deviations], angles)
 
-    zero = jnp.zeros(5, covariance.dtype)
-    jacobian = jax.jacfwd(values)(zero)
-    return values(zero), jnp.sqrt(jnp.einsum("ij,jk,ik->i", jacobian, covariance, jacobian))
+    def values(*step: Array) -> tuple[Array, ...]:
+        rotation, base = found.moved(step).relative()
+        return (*base, *rot.omega_phi_kappa(rot.transpose(rotation)))
+
+    zero = (jnp.zeros_like(sigma0),) * 5
+    jacobian = jax.jacfwd(values, argnums=tuple(range(5)))(*zero)
+    variance = lambda row: sum(row[i] * row[j] * cofactor[i, j] for i in range(5) for j in range(5))
+    angles = (False,) * 3 + (True,) * 3
+    return degrees(values(*zero), angles), degrees([sigma0 * root(variance(row)) for row in jacobian], angles)
+
+
+def element_names(system: type[AbstractElements]) -> tuple[str, ...]:
+    """Names of the numbers that are reported."""
+    if system is RelativePose:
+        return "bx", "by", "bz", "omega", "phi", "kappa"
+    return ("bx", *system.names) if system is DependentElements else system.names
+
+
+def unit_of(name: str, units: Units) -> str:
+    """The unit of such a number."""
+    return "deg" if name not in ("bx", "by", "bz") else "" if units.model == "bases" else units.model
+
+
+def given(name: str, system: type[AbstractElements]) -> bool:
+    """Whether such a number is given, not adjusted."""
+    return system is DependentElements and name == "bx"
+
+
+_all_values = jax.jit(jax.vmap(element_values))
 
 
 def shown_elements(orientations: list[Orientation], units: Units) -> list[list[Element]]:
-    """The elements of each orientation with their standard deviations: angles in degrees, lengths in model units.
-
-    Of a `RelativePose`: the unit base vector and the angles of M = R3(kappa) R2(phi) R1(omega).
-    """
+    """The elements of each orientation with their standard deviations."""
     system = type(orientations[0].elements)
-    covariances = [np.square(o.sigma0) * o.cofactor for o in orientations]
-    if system is RelativePose:
-        names, angles = ("bx", "by", "bz", "omega", "phi", "kappa"), (False,) * 3 + (True,) * 3
-        poses = jax.tree.map(lambda *a: np.stack(a), *[o.elements for o in orientations])
-        values, deviations = map(np.asarray, _angles_and_base(poses, np.stack(covariances)))
-    else:
-        names, angles = system.names, system.angles
-        values = np.array([[getattr(o.elements, name) for name in names] for o in orientations])
-        deviations = np.array([np.sqrt(np.diagonal(c)) for c in covariances])
-    scale = np.where(angles, 180 / np.pi, 1.0)
-    length = "" if system is RelativePose else units.model
-    kinds = ["deg" if angle else length for angle in angles]
-    out = []
-    for o, value, deviation in zip(orientations, (values * scale).tolist(), (deviations * scale).tolist(), strict=True):
-        given = (
-            [Element("bx", units.model, float(o.elements.bx), None)]
-            if isinstance(o.elements, DependentElements)
-            else []
-        )
-        out.append(given + [Element(*entry) for entry in zip(names, kinds, value, deviation, strict=True)])
-    return out
+    stacked = jax.tree.map(lambda *a: np.stack(a), *[(o.elements, o.cofactor, o.sigma0) for o in orientations])
+    values, deviations = _all_values(*stacked)
+    names = element_names(system)
+    return [
+        [
+            Element(name, unit_of(name, units), value, None if given(name, system) else deviation)
+            for name, value, deviation in zip(names, row, spread, strict=True)
+        ]
+        for row, spread in zip(np.stack(values, 1).tolist(), np.stack(deviations, 1).tolist(), strict=True)
+    ]
 
 
 def solutions(

@@ -8,7 +8,7 @@ coordinates. Nothing is skipped or guessed: whatever does not fit stops the read
 import csv
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -90,27 +90,18 @@ def read(path: Path) -> Table:
 
 def parse(text: str, file: str, name: str) -> Table:
     """The pairs of CSV text. `file` is named in errors, `name` is the pair's where the table has no column `pair`."""
-    rows = _rows(text, file)
-    line, header = next(rows, (1, None))
-    if header is None:
-        raise TableError(file, 1, None, "no text at all", f"a header line with {ACCEPTED}")
-    columns = _columns(header, file, line)
-    numbers = [c for c in (*REQUIRED[1:], "sigma") if c in columns]
+    line = 1
     pairs: dict[str, Measurements] = {}
     seen: dict[str, dict[str, int]] = {}
     places: dict[tuple, str] = {}
     twins: dict[str, list[str]] = {}
-    for line, row in rows:
-        _check_length(row, columns, file, line)
-        point = _name(row[columns["point"]], file, line, "point")
-        pair = _name(row[columns["pair"]], file, line, "pair") if "pair" in columns else name
+    for line, pair, point, values in checked(io.StringIO(text, newline=""), file, name):
         first = seen.setdefault(pair, {}).setdefault(point, line)
         if first != line:
             found = f"{point!r} a second time in pair {pair!r} (first on line {first})"
             raise TableError(
                 file, line, "point", found, "each point once in a pair; rename it or delete one of the two"
             )
-        values = tuple(_number(row[columns[c]], file, line, c) for c in numbers)
         twin = places.setdefault((pair, *values[:4]), point)
         if twin != point:
             twins.setdefault(pair, []).append(f"{point} = {twin} (line {line})")
@@ -123,6 +114,21 @@ def parse(text: str, file: str, name: str) -> Table:
     return Table(file, list(pairs.values()), [_twins(file, pair, found) for pair, found in twins.items()])
 
 
+def checked(lines: Iterable[str], file: str, name: str = "") -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
+    """(line number, pair, point, numbers) of every line below the header, each field looked at. Raises TableError."""
+    rows = _rows(lines, file)
+    line, header = next(rows, (1, None))
+    if header is None:
+        raise TableError(file, 1, None, "no text at all", f"a header line with {ACCEPTED}")
+    columns = _columns(header, file, line)
+    numbers = [c for c in (*REQUIRED[1:], "sigma") if c in columns]
+    for line, row in rows:
+        _check_length(row, columns, file, line)
+        point = _name(row[columns["point"]], file, line, "point")
+        pair = _name(row[columns["pair"]], file, line, "pair") if "pair" in columns else name
+        yield line, pair, point, tuple(_number(row[columns[c]], file, line, c) for c in numbers)
+
+
 def _twins(file: str, pair: str, found: list[str]) -> str:
     named = ", ".join(found[:5]) + (f" and {len(found) - 5} more" if len(found) > 5 else "")
     return (
@@ -131,9 +137,9 @@ def _twins(file: str, pair: str, found: list[str]) -> str:
     )
 
 
-def _rows(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
+def _rows(lines: Iterable[str], file: str) -> Iterator[tuple[int, list[str]]]:
     """(line number, fields) of every line that is not blank."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True, skipinitialspace=True)
+    reader = csv.reader(lines, strict=True, skipinitialspace=True)
     while True:
         try:
             row = next(reader)

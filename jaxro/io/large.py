@@ -1,0 +1,151 @@
+"""One call of `jaxro orient` or `jaxro clean` with Parquet tables, from its options to the end of the work."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from .. import __version__
+from ..ragged import planned
+from ..rejection import AbstractProcedure
+from . import files, job as jobs, parquet
+from .console import consoles, progress
+from .job import Options
+from .records import TABLES, Recorder
+from .report import table as terminal_table
+from .streaming import CONVERTED, PART_ROWS, Job, Work, here, parts
+from .tables import TableError
+from .tolerances import tolerances
+
+
+@dataclass(frozen=True)
+class Large:
+    """What the user asked for besides `Options`."""
+
+    tables: str | None = None
+    resume: bool = False
+    part_rows: int = PART_ROWS
+    engine: Callable[[Job, Callable[[int], None]], Iterable[dict[str, Any]]] = here
+
+
+def run(options: Options, large: Large, procedure: tuple[str, AbstractProcedure] | None = None) -> bool:
+    """Plan, work, tell. True if every pair is usable. Raises TableError; what is finished then can be resumed."""
+    started = time.monotonic()
+    console, errors = consoles()
+    job = prepared(options, large, procedure)
+    told = "Cleaning" if procedure else "Orienting"
+    with progress(errors, told, job.pairs) as tell:
+        tell(job.done)
+        for entry in large.engine(job, tell):
+            job.finished(entry)
+    summary = job.end()
+    show(console, job, summary, time.monotonic() - started)
+    return summary["results"].get("successful", 0) + summary["results"].get("no_redundancy", 0) == job.pairs
+
+
+def prepared(options: Options, large: Large, procedure: tuple[str, AbstractProcedure] | None) -> Job:
+    """The job, its journal begun or read. Raises TableError, and then leaves nothing that was not there before."""
+    if options.file is None or options.out is None:
+        missing = "FILE" if options.file is None else "--out"
+        raise TableError(missing, None, None, "nothing", "a table and --out DIR where results are Parquet tables")
+    chosen = tuple(name.strip() for name in (large.tables or "elements,residuals,points").split(","))
+    for name in chosen:
+        if name not in TABLES:
+            raise TableError("--tables", None, None, repr(name), f"some of {','.join(TABLES)}")
+    folder = options.out.absolute().with_name(f"{options.out.absolute().name}.unfinished")
+    _check(options.out, folder, options.force, large.resume)
+    try:
+        job = _planned(options, large, procedure, chosen, folder)
+        job.go_on() if large.resume else job.begin()
+    except TableError:
+        if not large.resume:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return job
+
+
+def _planned(
+    options: Options,
+    large: Large,
+    procedure: tuple[str, AbstractProcedure] | None,
+    chosen: tuple[str, ...],
+    folder: Path,
+) -> Job:
+    assert options.file is not None and options.out is not None
+    source = options.file
+    if source.suffix != ".parquet":
+        source = folder / CONVERTED
+        if not (large.resume and source.exists()):
+            folder.mkdir(parents=True, exist_ok=True)
+            parquet.converted(options.file, source)
+    table = parquet.Source(source)
+    system = jobs.SYSTEMS[options.elements or "relative"]
+    jobs.check_numbers(options, table.has_sigma, str(options.file), system)
+    known = table.has_sigma or options.sigma is not None
+    scan = table.scan()
+    pieces = parts(scan.begins, large.part_rows)
+    keywords = {"elements": system, "base": options.base, "residual": jobs.RESIDUALS[options.residual]}
+    order = tuple(name for name in TABLES if name in ("elements", *chosen))
+    if procedure and "residuals" not in order:
+        order = (*order[:1], "residuals", *order[1:])
+    work = Work(
+        source.absolute(),
+        folder,
+        planned(scan.lengths, len(pieces)),
+        jobs.read_cameras(options, jobs.MEASURED),
+        options.sigma,
+        Recorder(system, order, known, procedure is not None),
+        keywords,
+        jobs.units_of(options, table.has_sigma, system),
+        procedure[1] if procedure else None,
+    )
+    return Job(work, pieces, options.out.absolute(), _request(options, order, procedure))
+
+
+def _check(out: Path, folder: Path, force: bool, resume: bool) -> None:
+    """Raises TableError unless the work may begin, or go on."""
+    files.check_target(out, force)
+    if resume and not folder.exists():
+        raise TableError(folder, None, None, "no such folder", "the --out of a run that was stopped, to resume it")
+    if folder.exists() and not resume:
+        if not force:
+            expected = "--resume to go on, or --force to begin anew"
+            raise TableError(folder, None, None, "a run that was stopped", expected)
+        shutil.rmtree(folder)
+
+
+def _request(options: Options, tables: tuple[str, ...], procedure: tuple[str, AbstractProcedure] | None) -> dict:
+    """What is asked for, as the journal and the summary keep it; another request does not resume a run."""
+    assert options.file is not None
+    asked: dict[str, Any] = {"program": f"jaxro {__version__}", "file": str(options.file)}
+    asked |= {"bytes": options.file.stat().st_size, "tables": list(tables)}
+    named = {"camera", "focal", "principal_point", "pixel_size", "y_down", "sigma", "elements", "base", "residual"}
+    asked |= {name: _plain(getattr(options, name)) for name in sorted(named | {"unit"})}
+    asked["elements"] = options.elements or "relative"
+    if procedure is not None:
+        asked |= {"procedure": procedure[0], "tolerances": tolerances(procedure[1])}
+    return asked
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
+
+
+def show(console: Console, job: Job, summary: dict[str, Any], seconds: float) -> None:
+    """How the pairs ended, and where the tables are."""
+    for kind, title in (("outcomes", "cleaning"), ("results", "orientation")):
+        if kind in summary:
+            rows = terminal_table(title, "pairs", "%")
+            for name, number in summary[kind].items():
+                rows.add_row(name, f"{number:,}", f"{100 * number / summary['pairs']:.2f}")
+            console.print(rows)
+    doubles = summary["pairs_with_two_points_of_one_name"]
+    if doubles:
+        named = ", ".join(doubles[:5]) + (", ..." if len(doubles) > 5 else "")
+        console.print(f"[yellow]Mind:[/yellow] two points of one name in pairs {named}", markup=True)
+    rate = f"{summary['pairs']:,} pairs, {summary['rows']:,} points in {seconds:.1f} s"
+    console.print(f"{rate}. Written to {job.target}: {', '.join(job.work.recorder.tables)}, summary.json", markup=False)

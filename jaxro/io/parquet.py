@@ -1,0 +1,288 @@
+"""Tables of any size: measured coordinates from Parquet, part by part; CSV text made Parquet first.
+
+Columns are those of `tables`. The rows of a pair stand one behind the other. Names may be text or whole numbers. A
+coordinate that is missing or not finite makes its pair `non_finite_input`, and harms no other.
+"""
+
+import csv
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..pairs import Camera
+from ..ragged import Ragged
+from . import tables
+from .tables import ACCEPTED, OPTIONAL, REQUIRED, SHORT, TableError
+
+try:
+    import pyarrow as pa
+    import pyarrow.csv as arrow_csv
+    import pyarrow.parquet as pq
+except ModuleNotFoundError:
+    raise SystemExit("Parquet tables need pyarrow: pip install 'jaxro[cli,tables]'") from None
+
+BATCH = 1 << 18
+"""Rows decoded at once."""
+
+
+class Scan(NamedTuple):
+    """Where the pairs of a table begin, with the end of the table behind them."""
+
+    begins: Int[np.ndarray, " pairs+1"]
+
+    @property
+    def lengths(self) -> Int[np.ndarray, " pair"]:
+        """Points of every pair."""
+        return np.diff(self.begins)
+
+
+class Source:
+    """A Parquet table of measured points. Raises TableError where it is none."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        try:
+            self._file = pq.ParquetFile(path, pre_buffer=False)
+        except (OSError, pa.ArrowInvalid) as error:
+            found = f"no Parquet file that can be read ({str(error).splitlines()[0]})"
+            raise TableError(path, None, None, found, "a Parquet table of measured points") from None
+        self.columns = _columns(path, self._file.schema_arrow)
+        self._position, self._batches = -1, iter(())
+        self._left: Any = None
+
+    @property
+    def has_sigma(self) -> bool:
+        """Whether the table has a column sigma."""
+        return "sigma" in self.columns
+
+    @property
+    def count(self) -> int:
+        """Rows of the table."""
+        return self._file.metadata.num_rows
+
+    def scan(self) -> Scan:
+        """Where the pairs begin: reads the column `pair` alone. Raises TableError where a pair comes in two parts."""
+        if not self.count:
+            raise TableError(self.path, None, None, "no points", "one row for every measured point")
+        if "pair" not in self.columns:
+            return Scan(np.array([0, self.count]))
+        begins, names, row, last = [], [], 0, None
+        for batch in self._file.iter_batches(BATCH, columns=[self.columns["pair"]]):
+            column = batch.column(0)
+            if column.null_count:
+                empty = row + int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
+                raise TableError(self.path, None, "pair", f"nothing in row {empty + 1}", "the name of the pair")
+            starts = _runs(column, last)
+            begins.append(starts + row)
+            names.append(column.take(starts))
+            row, last = row + len(column), column[-1].as_py()
+        found = np.concatenate(begins)
+        self._once(pa.chunked_array(names), found)
+        return Scan(np.append(found, row))
+
+    def _once(self, names: Any, begins: np.ndarray) -> None:
+        if len(names.unique()) == len(names):
+            return
+        seen: set = set()
+        for name, row in zip(names.to_pylist(), begins, strict=True):
+            if name in seen:
+                found = f"pair {name!r} again in row {row + 1}, after other pairs"
+                raise TableError(
+                    self.path, None, "pair", found, "the rows of a pair one behind the other: sort the table"
+                )
+            seen.add(name)
+
+    def rows(self, begin: int, end: int) -> Any:
+        """These rows as an Arrow table with the full names of the columns; one behind the other is read only once."""
+        if begin != self._position:
+            self._seek(begin)
+        taken, wanted = [], end - begin
+        while wanted:
+            piece = self._left if self._left is not None else next(self._batches)
+            part = piece.slice(0, wanted)
+            self._left = piece.slice(len(part)) if len(part) < len(piece) else None
+            taken.append(part)
+            wanted -= len(part)
+        self._position = end
+        table = pa.Table.from_batches(taken)
+        return table.rename_columns([_full(name) for name in table.column_names])
+
+    def _seek(self, row: int) -> None:
+        """The next batch begins with this row."""
+        group, before = 0, 0
+        while before + self._file.metadata.row_group(group).num_rows <= row:
+            before += self._file.metadata.row_group(group).num_rows
+            group += 1
+        groups = list(range(group, self._file.metadata.num_row_groups))
+        self._batches = self._file.iter_batches(BATCH, row_groups=groups, columns=list(self.columns.values()))
+        self._left, skip = None, row - before
+        while skip:
+            piece = next(self._batches)
+            self._left = piece.slice(skip) if skip < len(piece) else None
+            skip -= min(skip, len(piece))
+
+
+def _full(name: str) -> str:
+    given = name.strip().lower()
+    return SHORT.get(given, given)
+
+
+def _columns(path: Path, schema: Any) -> dict[str, str]:
+    """The columns in the table by their full names. Raises TableError for missing, unknown or unsuitable ones."""
+    columns: dict[str, str] = {}
+    for field in schema:
+        full = _full(field.name)
+        if full not in REQUIRED + OPTIONAL:
+            expected = f"{ACCEPTED}; delete or rename it, none is ignored"
+            raise TableError(path, None, field.name, "an unknown column", expected)
+        if full in columns:
+            raise TableError(path, None, field.name, "this column a second time", "each column once")
+        named = full in ("pair", "point")
+        t = field.type.value_type if pa.types.is_dictionary(field.type) else field.type
+        text = pa.types.is_string(t) or pa.types.is_large_string(t)
+        good = text or pa.types.is_integer(t) if named else pa.types.is_floating(t) or pa.types.is_integer(t)
+        if not good:
+            expected = "text or whole numbers" if named else "numbers"
+            raise TableError(path, None, field.name, f"values of type {field.type}", expected)
+        columns[full] = field.name
+    for name in REQUIRED:
+        if name not in columns:
+            raise TableError(path, None, name, "no such column", ACCEPTED)
+    return columns
+
+
+def _runs(column: Any, last: Any) -> np.ndarray:
+    """Where another value begins; `last`: the value before the first."""
+    codes = column.dictionary_encode().indices.to_numpy() if not pa.types.is_dictionary(column.type) else None
+    codes = column.indices.to_numpy() if codes is None else codes
+    starts = np.flatnonzero(np.diff(codes)) + 1
+    return starts if last is not None and column[0].as_py() == last else np.concatenate([[0], starts])
+
+
+def names(table: Any, starts: np.ndarray, file: str) -> Any:
+    """The name of each pair of a part, as an Arrow array; of a table without a column `pair` that of the file."""
+    if "pair" not in table.column_names:
+        return pa.array([Path(file).stem] * len(starts))
+    return table.column("pair").take(pa.array(starts)).combine_chunks()
+
+
+def owners(begins: np.ndarray) -> Any:
+    """Of every row of a part the number of its pair."""
+    return pa.array(np.repeat(np.arange(len(begins) - 1), np.diff(begins)))
+
+
+def twice(table: Any, begins: np.ndarray) -> np.ndarray:
+    """The pairs of a part that have two points of one name."""
+    codes = table.column("point").combine_chunks()
+    codes = codes if pa.types.is_dictionary(codes.type) else codes.dictionary_encode()
+    codes = codes.indices.to_numpy(zero_copy_only=False).astype(np.int64)
+    rising = np.diff(codes) > 0
+    rising[begins[1:-1] - 1] = True
+    if np.all(rising):  # the names come in one order in every pair: none can come twice
+        return np.zeros(0, int)
+    key = np.sort(owners(begins).to_numpy() * (int(codes.max()) + 1) + codes)
+    return np.unique(key[1:][np.diff(key) == 0] // (int(codes.max()) + 1))
+
+
+def ragged(
+    table: Any,
+    begins: np.ndarray,
+    cameras: tuple[Camera, Camera] | list[tuple[Camera, Camera]],
+    sigma: float | None,
+    file: str,
+) -> Ragged:
+    """The points of a part in photo coordinates; cameras for all pairs, or of each. Missing numbers are NaN."""
+    numbers = lambda name: np.asarray(table.column(name).cast(pa.float64()).to_numpy(), np.float64)
+    each = lambda side, value: _spread(cameras, side, value, begins)
+    photo = []
+    for side, (u, v) in enumerate((("x_left", "y_left"), ("x_right", "y_right"))):
+        size = each(side, lambda c: c.pixel_size)
+        sign = each(side, lambda c: -1.0 if c.y_down else 1.0)
+        photo.append((numbers(u) - each(side, lambda c: c.principal_point[0])) * size)
+        photo.append((numbers(v) - each(side, lambda c: c.principal_point[1])) * (sign * size))
+    count = len(table)
+    given = numbers("sigma") if "sigma" in table.column_names else None if sigma is None else np.full(count, sigma)
+    deviation = np.ones(count) if given is None else given * each(0, lambda c: c.pixel_size)
+    pairs = len(begins) - 1
+    if given is not None and np.any(each(0, lambda c: c.pixel_size) != each(1, lambda c: c.pixel_size)):
+        expected = "coordinates in photo units where the pixel sizes differ, so that one sigma serves both photos"
+        raise TableError(file, None, "sigma", "sigma with different pixel sizes of left and right photos", expected)
+    focals = [
+        np.full(pairs, cameras[side].focal)
+        if isinstance(cameras, tuple)
+        else np.array([both[side].focal for both in cameras])
+        for side in (0, 1)
+    ]
+    return Ragged(begins, *photo, deviation, np.ones(count, bool), *focals)
+
+
+def _spread(cameras: Any, side: int, value: Any, begins: np.ndarray) -> Float[np.ndarray, "..."]:
+    """A constant of the cameras, for all rows or for each."""
+    if isinstance(cameras, tuple):
+        return np.asarray(value(cameras[side]))
+    return np.repeat(np.array([value(both[side]) for both in cameras], np.float64), np.diff(begins))
+
+
+def converted(source: Path, target: Path) -> None:
+    """A CSV table as a Parquet table, in bounded memory. Raises TableError with line and column."""
+    try:
+        with source.open(encoding="utf-8-sig", newline="") as file:
+            header = next(csv.reader(file), [])
+    except (OSError, UnicodeDecodeError, csv.Error):
+        header = []
+    full = [_full(name) for name in header]
+    draft = target.with_suffix(".partial")
+    try:
+        types = {c: pa.string() if c in ("pair", "point") else pa.float64() for c in full}
+        reader = arrow_csv.open_csv(
+            source,
+            read_options=arrow_csv.ReadOptions(column_names=full, skip_rows=1, block_size=1 << 24),
+            convert_options=arrow_csv.ConvertOptions(column_types=types, null_values=[]),
+        )
+        writer = None
+        for batch in reader:
+            writer = writer or pq.ParquetWriter(draft, batch.schema, **_encoding(batch.schema))
+            _check(batch)
+            writer.write_batch(batch)
+        if writer is None:
+            raise pa.ArrowInvalid("no rows")
+        writer.close()
+        os.replace(draft, target)
+    except (pa.ArrowInvalid, pa.ArrowKeyError, OSError) as error:
+        draft.unlink(missing_ok=True)
+        for _ in _careful(source):  # says what is wrong where
+            pass
+        raise TableError(source, None, None, str(error).splitlines()[0], "a CSV table of measured points") from None
+
+
+def _check(batch: Any) -> None:
+    """Raises ArrowInvalid for what the careful reader would not take."""
+    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+        if name in ("pair", "point"):
+            if any(not text.strip() for text in column.unique().to_pylist()):
+                raise pa.ArrowInvalid(f"an empty field in column {name}")
+        elif not np.all(np.isfinite(values := column.to_numpy())) or (name == "sigma" and not np.all(values > 0)):
+            raise pa.ArrowInvalid(f"a number that cannot be used in column {name}")
+
+
+def _careful(path: Path) -> Iterator[tuple]:
+    """The lines of a CSV table as `tables` reads them, one at a time. Raises TableError."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            yield from tables.checked(file, str(path))
+    except (OSError, UnicodeDecodeError):
+        tables.read_text(path)  # says which
+
+
+def write(table: Any, path: Path) -> None:
+    """A Parquet file; only names are worth a dictionary."""
+    pq.write_table(table, path, **_encoding(table.schema))
+
+
+def _encoding(schema: Any) -> dict[str, Any]:
+    repeated = [f.name for f in schema if not (pa.types.is_floating(f.type) or pa.types.is_boolean(f.type))]
+    return {"use_dictionary": repeated, "compression": "snappy"}

@@ -1,0 +1,282 @@
+"""Pairs of every length in few batches: flat arrays, padded to the few sizes that waste least."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, PyTree
+
+from .batch import Report, Way, decided, oriented, oriented_near, settled, stages, unheard
+from .orientation import Orientation
+from .pairs import Pair, pair
+from .rejection import AbstractProcedure, Rejection
+from .starts import AbstractStart, Auto
+
+SIZES = 7
+"""Sizes to which pairs are padded at most: each is another program to compile."""
+
+FEWER = 4
+"""The same where a program takes longer to compile: general starts, searches for wrong points."""
+
+CHEAP = 1_000_000
+"""Padded points that take less time to calculate than another program takes to compile."""
+
+SHORTEST = 8
+"""The smallest size."""
+
+Flat = Float[np.ndarray, " row"]
+
+
+class Ragged(NamedTuple):
+    """Pairs of any lengths one behind the other, in NumPy: pair k has the rows `begins[k]` to `begins[k + 1]`."""
+
+    begins: Int[np.ndarray, " pairs+1"]
+    x_left: Flat
+    y_left: Flat
+    x_right: Flat
+    y_right: Flat
+    sigma: Flat
+    mask: Bool[np.ndarray, " row"]
+    focal_left: Float[np.ndarray, " pair"]
+    focal_right: Float[np.ndarray, " pair"]
+
+    @property
+    def lengths(self) -> Int[np.ndarray, " pair"]:
+        """Points of every pair."""
+        return np.diff(self.begins)
+
+    @property
+    def even(self) -> bool:
+        """Whether all pairs have as many points, so that they are a batch already (of sizes from 8 on)."""
+        return bool(len(self.begins) > 1 and np.all(self.lengths == max(self.lengths[0], SHORTEST)))
+
+    def padded(self, members: Int[np.ndarray, " some"], size: int) -> Pair:
+        """These pairs as one batch, in NumPy, with zeros up to `size` points, masked out."""
+        rows, there = self._places(members, size)
+        points = (self.x_left, self.y_left, self.x_right, self.y_right, self.sigma, self.mask)
+        if isinstance(rows, slice):
+            fields = [a[rows].reshape(-1, size) for a in points]
+        else:
+            fields = [np.zeros(there.shape, a.dtype) for a in points]
+            for field, a in zip(fields, points, strict=True):
+                field[there] = a[rows]
+        return jax.tree.unflatten(_structure(), [*fields, self.focal_left[members], self.focal_right[members]])
+
+    def gathered(self, out: np.ndarray, members: Int[np.ndarray, " some"], found: np.ndarray) -> None:
+        """The values (pair, point) of a padded batch into their rows of `out`."""
+        rows, there = self._places(members, found.shape[1])
+        out[rows] = found.reshape(-1) if isinstance(rows, slice) else found[there]
+
+    def _places(self, members: np.ndarray, size: int) -> tuple[Any, Bool[np.ndarray, "some size"]]:
+        """The rows of these pairs, and where in the batch they stand."""
+        lengths = self.lengths[members]
+        there = np.arange(size)[None, :] < lengths[:, None]
+        first, last = members[0], members[-1]
+        if last - first + 1 == len(members) and np.all(lengths == size):  # one behind the other, nothing to pad
+            return slice(self.begins[first], self.begins[last + 1]), there
+        return (self.begins[members][:, None] + np.arange(size)[None, :])[there], there
+
+
+@lru_cache
+def _structure() -> Any:
+    """Of a `Pair`, to be filled with arrays of NumPy."""
+    return jax.tree.structure(jax.eval_shape(lambda: pair(*(jnp.zeros((4, 1))), focal=1.0)))
+
+
+def join(pairs: Sequence[Pair]) -> Ragged:
+    """Single pairs of any lengths as one `Ragged`. Raises ValueError for none."""
+    if not pairs:
+        raise ValueError("join: no pairs given")
+    begins = np.cumsum([0] + [one.x_left.shape[-1] for one in pairs])
+    fields = {name: [np.asarray(getattr(one, name)) for one in pairs] for name in Ragged._fields[1:]}
+    return Ragged(
+        begins, *(np.stack(a) if name.startswith("focal") else np.concatenate(a) for name, a in fields.items())
+    )
+
+
+def sizes(lengths: Int[np.ndarray, " pair"], most: int = SIZES) -> tuple[int, ...]:
+    """The at most `most` sizes with the least padding, a size more only where it saves more than it costs to compile.
+
+    Exactly the least for up to 256 different lengths, by dynamic programming over them; of more every so many.
+    """
+    if not len(lengths):
+        return (SHORTEST,)
+    known, counts = np.unique(np.maximum(lengths, SHORTEST), return_counts=True)
+    ends = np.unique(np.round(np.linspace(0, len(known) - 1, 256)).astype(int))
+    below = np.concatenate([[0], np.cumsum(counts)[ends]])  # pairs up to each candidate
+    candidates = known[ends]
+    cost = np.full(len(below), np.inf)  # of all pairs up to a candidate, with the sizes so far
+    cost[0], choices, best = 0.0, [], (np.inf, 0)
+    for k in range(most):
+        whole = cost[None, :] + candidates[:, None] * (below[1:, None] - below[None, :])
+        whole[np.arange(len(below))[None, :] > np.arange(len(candidates))[:, None]] = np.inf
+        choices.append(np.argmin(whole, axis=1))
+        cost = np.concatenate([[np.inf], np.min(whole, axis=1)])
+        best = min(best, (cost[-1] + CHEAP * k, k))
+    end, out = len(candidates), []
+    for choice in reversed(choices[: best[1] + 1]):
+        out.append(int(candidates[end - 1]))
+        end = int(choice[end - 1])
+    return tuple(reversed(out))
+
+
+class Plan(NamedTuple):
+    """Sizes to pad to, ascending, and the pairs of a call of each program; one plan for many parts of one table, so
+    that no part compiles anything."""
+
+    sizes: tuple[int, ...]
+    slabs: tuple[int, ...]
+    fewer: tuple[int, ...]
+
+
+CALL_POINTS = 1 << 17
+"""Points per call at most: see `batch.SLAB_POINTS`."""
+
+
+def planned(lengths: Int[np.ndarray, " pair"], parts: int = 1) -> Plan:
+    """A plan for pairs of these lengths that come in so many parts of about the same kind."""
+    chosen = sizes(lengths)
+    bucket = np.searchsorted(chosen, lengths)
+    members = np.bincount(bucket, minlength=len(chosen)) / parts
+    power = lambda number: 1 << max(int(number), 1).bit_length() - 1
+    # a call holds a quarter of the pairs of a part at most: what the last one is filled up with is not much
+    slabs = tuple(min(power(CALL_POINTS / size), power(m / 4)) for size, m in zip(chosen, members, strict=True))
+    return Plan(chosen, slabs, sizes(lengths, FEWER))
+
+
+PER_POINT = ("parallax", "residuals", "redundancy", "model", "in_front")
+"""What an `Orientation` holds of every point."""
+
+
+def split(pair: Pair, orientation: Orientation) -> tuple[PyTree, PyTree]:
+    """An orientation in what it holds of the pair and of the points."""
+    fields = lambda o: [getattr(o, name) for name in PER_POINT]
+    nothing = eqx.tree_at(fields, jax.tree.map(lambda _: True, orientation), replace_fn=lambda _: False)
+    return eqx.partition(orientation, nothing)
+
+
+def orient_ragged(
+    pairs: Ragged,
+    *,
+    read: Callable[[Pair, Orientation], tuple[PyTree, PyTree]] = split,
+    plan: Plan | None = None,
+    progress: Report | None = None,
+    threads: int | None = None,
+    start: AbstractStart | Any = Auto(),  # noqa: B008 (frozen)
+    **options,
+) -> PyTree:
+    """`orient` of pairs of any lengths, on all cores: an `Orientation` in NumPy whose fields of the points are flat,
+    in the rows of `pairs`.
+
+    `read(pair, orientation)`: what is wanted instead, of the pair and of every point; the result then is these two.
+    Other keywords are those of `orient`. The results are those of `orient` one by one, to rounding.
+    """
+    plan = plan or planned(pairs.lengths)
+    options = settled(pairs.x_left.dtype, options) | {"read": read, "start": start}
+    out = _Out(pairs, progress)
+    rest = [np.zeros(0, int)]
+    for members, batch, way in _batches(pairs, plan.sizes, plan.slabs, threads):
+        if isinstance(start, Auto):
+            found, fits = oriented_near(batch, options, way, out.told)
+            rest.append(members[~fits])
+        else:
+            found = oriented(batch, options, way, out.told)
+        out.store(members, found)
+    general = options | {"start": getattr(start, "general", start)}
+    for members, batch, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(rest)):
+        out.store(members, oriented(batch, general, way))
+    return eqx.combine(*out.tree) if read is split else out.tree
+
+
+class Decisions(NamedTuple):
+    """What a procedure decided: of every row whether it is kept, in which round it went, and its statistic then; of
+    every pair the outcome, a number of `rejection.OUTCOMES`."""
+
+    kept: Bool[np.ndarray, " row"]
+    order: Int[np.ndarray, " row"]
+    statistic: Flat
+    outcome: Int[np.ndarray, " pair"]
+
+
+def decisions(rejection: Rejection) -> tuple[PyTree, PyTree]:
+    """The outcome of a pair; of every point (kept, order, statistic)."""
+    return rejection.outcome._value, (rejection.mask, rejection.order, rejection.statistic)
+
+
+def clean_ragged(
+    pairs: Ragged,
+    procedure: AbstractProcedure,
+    *,
+    select: Callable[[Rejection], tuple[PyTree, PyTree]] = decisions,
+    plan: Plan | None = None,
+    progress: Report | None = None,
+    threads: int | None = None,
+) -> PyTree:
+    """`procedure` of pairs of any lengths, on all cores: its `Decisions`, flat, in the rows of `pairs`.
+
+    `select(rejection)`: what is wanted instead, of the pair and of every point; the result then is these two.
+    """
+    plan = plan or planned(pairs.lengths)
+    first, *others = stages(procedure)
+    out = _Out(pairs, progress)
+    again = np.arange(len(pairs.lengths))
+    for number, stage in enumerate((first, *others)):
+        doubtful = [np.zeros(0, int)]
+        sizes = plan.fewer if number else plan.sizes
+        for members, batch, way in _batches(pairs, sizes, None, threads, again):
+            found, doubt = decided(batch, stage, select, way, unheard if number else out.told)
+            out.store(members, found)
+            doubtful.append(members[doubt])
+        again = np.concatenate(doubtful)
+    if select is not decisions:
+        return out.tree
+    outcome, (kept, order, statistic) = out.tree
+    return Decisions(kept, order, statistic, outcome)
+
+
+def _batches(
+    pairs: Ragged,
+    sizes: tuple[int, ...],
+    slabs: tuple[int, ...] | None,
+    threads: int | None,
+    members: Int[np.ndarray, " some"] | None = None,
+) -> Iterator[tuple[np.ndarray, Pair, Way]]:
+    """(members, batch, way) of each size; of all pairs or of some. Without `slabs` a call takes one chunk."""
+    members = np.arange(len(pairs.lengths)) if members is None else np.sort(members)
+    bucket = np.searchsorted(sizes, pairs.lengths[members])
+    for number, size in enumerate(sizes):
+        own = members[bucket == number]
+        if own.size:
+            yield own, pairs.padded(own, size), Way(threads, slab=slabs[number] if slabs else 1)
+
+
+class _Out:
+    """The results of all pairs, filled batch by batch, and how many are done."""
+
+    def __init__(self, pairs: Ragged, progress: Report | None):
+        self.tree: Any = None
+        self._pairs, self._progress, self._before = pairs, progress or unheard, 0
+
+    def told(self, done: int, total: int) -> None:
+        """Progress within one batch."""
+        if done == total:
+            self._before += total
+        self._progress(self._before + (0 if done == total else done), len(self._pairs.lengths))
+
+    def store(self, members: np.ndarray, found: tuple[PyTree, PyTree]) -> None:
+        """The values of these pairs, and of their points in the rows of all."""
+        if len(members) == len(self._pairs.lengths) and self._pairs.even:  # nothing to put in order
+            self.tree = found[0], jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), found[1])
+            return
+        if self.tree is None:
+            sizes = len(self._pairs.lengths), len(self._pairs.x_left)
+            empty = lambda count, drop: lambda a: np.empty((count, *a.shape[drop:]), a.dtype)
+            self.tree = jax.tree.map(empty(sizes[0], 1), found[0]), jax.tree.map(empty(sizes[1], 2), found[1])
+        for target, source in zip(jax.tree.leaves(self.tree[0]), jax.tree.leaves(found[0]), strict=True):
+            target[members] = source
+        for target, source in zip(jax.tree.leaves(self.tree[1]), jax.tree.leaves(found[1]), strict=True):
+            self._pairs.gathered(target, members, source)

@@ -1,0 +1,89 @@
+"""Pairs of every length together: the same results as one by one, and the least padding."""
+
+from itertools import combinations
+
+import jax
+import numpy as np
+import problems
+import pytest
+
+import jaxro
+from jaxro import Pair, ragged, simulation
+from jaxro.rejection import PROCEDURES
+
+LENGTHS = [6, 9, 3, 12, 9, 5, 8, 12, 7, 9]
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[Pair]:
+    """Near-vertical pairs of several lengths, every third in another position, one with a number missing."""
+    key = jax.random.key(3)
+    anywhere = jax.tree.map(np.asarray, simulation.random_pairs(key, len(LENGTHS), 12, focal=100.0)[0])
+    near = jax.tree.map(lambda a: a[:12] if np.ndim(a) else a, jax.tree.map(np.asarray, problems.tilted()))
+    out = []
+    for i, n in enumerate(LENGTHS):
+        whole = jax.tree.map(lambda a, i=i: a[i], anywhere) if i % 3 == 2 else near
+        out.append(jax.tree.map(lambda a, n=n: np.array(a[:n]) if np.ndim(a) else a, whole))
+    out[4].x_left[2] = np.nan
+    return out
+
+
+@pytest.fixture(scope="module")
+def together(pairs):
+    return ragged.join(pairs)
+
+
+PLAN = ragged.Plan((8, 12), (4, 4), (12,))
+
+
+def test_ragged_equals_one_by_one(pairs, together):
+    told = []
+    found = ragged.orient_ragged(together, plan=PLAN, progress=lambda done, total: told.append((done, total)))
+    assert told[-1] == (10, 10) and [done for done, _ in told] == sorted(done for done, _ in told)
+    for i, one in enumerate(pairs):
+        alone = problems.orient(jaxro.pad(jax.tree.map(jax.numpy.asarray, one), 12))
+        rows = slice(*together.begins[i : i + 2])
+        assert int(found.result._value[i]) == int(alone.result._value)
+        if bool(alone.usable):
+            names = ("qw", "qx", "qy", "qz", "bx", "by", "bz")
+            np.testing.assert_allclose(
+                [getattr(found.pose, name)[i] for name in names],
+                [getattr(alone.pose, name) for name in names],
+                atol=1e-12,
+            )
+            for name in ("parallax", "residuals", "redundancy"):
+                np.testing.assert_allclose(getattr(found, name)[rows], getattr(alone, name)[: LENGTHS[i]], atol=1e-11)
+
+
+def test_cleaning_equals_one_by_one(pairs, together):
+    procedure = PROCEDURES["worst-point"]
+    found = ragged.clean_ragged(together, procedure, plan=PLAN)
+    batch = jaxro.stack([jax.tree.map(jax.numpy.asarray, one) for one in pairs])
+    alone = problems.jit(jax.vmap(procedure))(batch)
+    np.testing.assert_array_equal(found.outcome, alone.outcome._value)
+    flat = lambda values: np.concatenate([np.asarray(values)[i, :n] for i, n in enumerate(LENGTHS)])
+    np.testing.assert_array_equal(found.kept, flat(alone.mask))
+    np.testing.assert_array_equal(found.order, flat(alone.order))
+
+
+@pytest.mark.parametrize("longest", [2_000, 10_000])
+def test_padding_of_any_lengths_stays_under_a_quarter(longest):
+    lengths = np.exp(np.random.default_rng(0).uniform(np.log(5), np.log(longest), 100_000)).astype(int)
+    sizes = np.array(ragged.sizes(lengths))
+    padded = sizes[np.searchsorted(sizes, lengths)]
+    assert len(sizes) <= 7 and np.all(padded >= lengths)
+    assert 1 - lengths.sum() / padded.sum() < 0.25
+
+
+def test_sizes_have_the_least_padding():
+    rng = np.random.default_rng(1)
+    lengths = rng.choice([8, 11, 14, 20, 33, 50, 64, 90], 500_000, p=rng.dirichlet(np.ones(8)))
+    known = np.unique(lengths)
+
+    def cost(sizes):
+        return np.sum(np.array(sizes)[np.searchsorted(sizes, lengths)]) + ragged.CHEAP * (len(sizes) - 1)
+
+    every = [(*some, known[-1]) for k in range(3) for some in combinations(known[:-1], k)]
+    assert cost(ragged.sizes(lengths, 3)) == min(map(cost, every))
+    assert ragged.sizes(np.array([6, 7, 20])) == (20,)
+    assert ragged.sizes(np.zeros(0, int)) == (8,)
