@@ -18,21 +18,21 @@ def machine() -> str:
 
 
 def main() -> int:
-    from . import engine, reading, rejection
+    from . import engine, reading, rejection, scale
     from .common import QUICK, Size
 
-    suites = engine.SUITES | rejection.SUITES | reading.SUITES
+    suites = engine.SUITES | rejection.SUITES | reading.SUITES | scale.SUITES
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few pairs, few repeats: does it run, roughly how fast")
     parser.add_argument("--only", choices=suites, action="append", help="this suite alone (may be repeated)")
-    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results.md")
+    parser.add_argument("--update-baseline", action="store_true", help="put the table into benchmarks/results.md")
     parser.add_argument(
         "--gate", action="store_true", help="fail where a figure is worse than the committed one allows"
     )
     options = parser.parse_args()
-    if options.write and (options.only or options.quick):
-        parser.error("--write takes a whole run: the table's figures stand beside each other")
+    if options.update_baseline and (options.only or options.quick):
+        parser.error("--update-baseline takes a whole run: the table's figures stand beside each other")
 
     measured = []
     for name in options.only or suites:
@@ -47,7 +47,7 @@ def main() -> int:
         worse = [m for m in measured if m.key in before and not m.held_against(before[m.key])]
         for metric in worse:
             print(f"worse: {metric.key}: {metric.value:.4g} {metric.unit}, committed {before[metric.key]:.4g}")
-    if options.write:
+    if options.update_baseline:
         contract.write(measured, machine())
     return 1 if worse else 0
 

@@ -23,6 +23,7 @@ class Size:
     """How much is measured: pairs by number of points, the share of them the slower peers get, repeats.
 
     `robust`: what multiplies the numbers of pairs of the robust suites. `trials`: of the comparison of procedures.
+    `rows`: of large tables.
     """
 
     pairs: dict[int, int] = field(default_factory=lambda: {16: 131_072, 200: 16_384, 1000: 4_096})
@@ -32,9 +33,19 @@ class Size:
     calls: int = 200
     robust: int = 8
     trials: int = 100_000
+    rows: int = 16_000_000
 
 
-QUICK = Size({16: 8_192, 200: 1_024, 1000: 256}, peer_share=4, repeats=3, processes=1, calls=20, robust=1, trials=2_048)
+QUICK = Size(
+    {16: 8_192, 200: 1_024, 1000: 256},
+    peer_share=4,
+    repeats=3,
+    processes=1,
+    calls=20,
+    robust=1,
+    trials=2_048,
+    rows=1_048_576,
+)
 
 
 def share(coordinates: Coordinates, pairs: int) -> Coordinates:

@@ -29,6 +29,9 @@ CHUNK_POINTS = 16384
 SEARCHED = 32
 """Pairs per chunk at most where random subsets are tried."""
 
+GENERAL = 8
+"""Pairs per chunk of the general start, which goes on until the last pair of its chunk is served."""
+
 FEW = 32
 """Points up to which wider vectors gain (3 to 10 %); with more they lose."""
 
@@ -90,7 +93,8 @@ def orient_batch(
     out, fits = oriented_near(host, options | {"start": start}, way, report)
     rest = np.flatnonzero(~fits)
     if rest.size:
-        again = oriented(jax.tree.map(lambda a: a[rest], host), options | {"start": start.general}, way, unheard)
+        left_over = jax.tree.map(lambda a: a[rest], host)
+        again = oriented(left_over, options | {"start": start.general}, Way(threads, chunk or GENERAL), unheard)
         _replace(out, rest, again)
     return _finish(out)
 
@@ -299,4 +303,4 @@ def _empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
 
 def _finish(out: PyTree) -> PyTree:
     """NumPy leaves as JAX arrays in the same memory, which nobody else holds."""
-    return jax.tree.map(lambda a: jax.device_put(a, may_alias=True), out)
+    return jax.device_put(out, may_alias=True)

@@ -10,20 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
-from .batch import Report, Way, decided, oriented, oriented_near, settled, stages, unheard
+from .batch import GENERAL, Report, Way, decided, oriented, oriented_near, settled, stages, unheard
 from .orientation import Orientation
 from .pairs import Pair, pair
 from .rejection import AbstractProcedure, Rejection
 from .starts import AbstractStart, Auto
 
-SIZES = 7
+SIZES = 8
 """Sizes to which pairs are padded at most: each is another program to compile."""
 
-FEWER = 4
+FEWER = 3
 """The same where a program takes longer to compile: general starts, searches for wrong points."""
 
-CHEAP = 1_000_000
-"""Padded points that take less time to calculate than another program takes to compile."""
+CHEAP = 250_000
+"""Padded points that take less time to calculate than it takes to load another program."""
 
 SHORTEST = 8
 """The smallest size."""
@@ -98,28 +98,32 @@ def join(pairs: Sequence[Pair]) -> Ragged:
     )
 
 
-def sizes(lengths: Int[np.ndarray, " pair"], most: int = SIZES) -> tuple[int, ...]:
-    """The at most `most` sizes with the least padding, a size more only where it saves more than it costs to compile.
+def steps(longest: int) -> Int[np.ndarray, " some"]:
+    """The sizes there are to choose from, 8, 10, 12, 14, 16, 20, ...: the same for every table, so that programs that
+    were compiled for one serve others."""
+    return np.array([(4 + quarter) << k for k in range(1, max(longest, SHORTEST).bit_length()) for quarter in range(4)])
 
-    Exactly the least for up to 256 different lengths, by dynamic programming over them; of more every so many.
-    """
+
+def sizes(lengths: Int[np.ndarray, " pair"], most: int = SIZES) -> tuple[int, ...]:
+    """The at most `most` of all `steps` with the least padding, found by dynamic programming; a size more only where it
+    saves more than it costs."""
     if not len(lengths):
         return (SHORTEST,)
-    known, counts = np.unique(np.maximum(lengths, SHORTEST), return_counts=True)
-    ends = np.unique(np.round(np.linspace(0, len(known) - 1, 256)).astype(int))
-    below = np.concatenate([[0], np.cumsum(counts)[ends]])  # pairs up to each candidate
-    candidates = known[ends]
-    cost = np.full(len(below), np.inf)  # of all pairs up to a candidate, with the sizes so far
-    cost[0], choices, best = 0.0, [], (np.inf, 0)
+    known = steps(int(np.max(lengths)))
+    counts = np.bincount(np.searchsorted(known, lengths), minlength=len(known))
+    known, counts = known[: np.flatnonzero(counts)[-1] + 1], counts[: np.flatnonzero(counts)[-1] + 1]
+    below = np.concatenate([[0], np.cumsum(counts)])  # pairs up to each step
+    cost = np.where(np.arange(len(below)) == 0, 0.0, np.inf)  # of all pairs up to a step, with the sizes so far
+    choices, best = [], (np.inf, 0)
     for k in range(most):
-        whole = cost[None, :] + candidates[:, None] * (below[1:, None] - below[None, :])
-        whole[np.arange(len(below))[None, :] > np.arange(len(candidates))[:, None]] = np.inf
+        whole = cost[None, :] + known[:, None] * (below[1:, None] - below[None, :])
+        whole[np.arange(len(below))[None, :] > np.arange(len(known))[:, None]] = np.inf
         choices.append(np.argmin(whole, axis=1))
         cost = np.concatenate([[np.inf], np.min(whole, axis=1)])
         best = min(best, (cost[-1] + CHEAP * k, k))
-    end, out = len(candidates), []
+    end, out = len(known), []
     for choice in reversed(choices[: best[1] + 1]):
-        out.append(int(candidates[end - 1]))
+        out.append(int(known[end - 1]))
         end = int(choice[end - 1])
     return tuple(reversed(out))
 
@@ -133,18 +137,17 @@ class Plan(NamedTuple):
     fewer: tuple[int, ...]
 
 
-CALL_POINTS = 1 << 17
-"""Points per call at most: see `batch.SLAB_POINTS`."""
+CALL_POINTS = tuple(1 << bits for bits in (17, 15, 13))
+"""Points per call of a program: few choices, so that programs that were compiled for one table serve others."""
 
 
 def planned(lengths: Int[np.ndarray, " pair"], parts: int = 1) -> Plan:
     """A plan for pairs of these lengths that come in so many parts of about the same kind."""
     chosen = sizes(lengths)
-    bucket = np.searchsorted(chosen, lengths)
-    members = np.bincount(bucket, minlength=len(chosen)) / parts
-    power = lambda number: 1 << max(int(number), 1).bit_length() - 1
-    # a call holds a quarter of the pairs of a part at most: what the last one is filled up with is not much
-    slabs = tuple(min(power(CALL_POINTS / size), power(m / 4)) for size, m in zip(chosen, members, strict=True))
+    members = np.bincount(np.searchsorted(chosen, lengths), minlength=len(chosen)) / parts
+    # a call holds a third of the pairs of a part at most: what the last one is filled up with is not much
+    fits = lambda size, own: next((c for c in CALL_POINTS if c * 3 <= own * size), CALL_POINTS[-1])
+    slabs = tuple(max(1, fits(size, own) // size) for size, own in zip(chosen, members, strict=True))
     return Plan(chosen, slabs, sizes(lengths, FEWER))
 
 
@@ -188,7 +191,7 @@ def orient_ragged(
         out.store(members, found)
     general = options | {"start": getattr(start, "general", start)}
     for members, batch, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(rest)):
-        out.store(members, oriented(batch, general, way))
+        out.store(members, oriented(batch, general, way._replace(chunk=GENERAL)))
     return eqx.combine(*out.tree) if read is split else out.tree
 
 
