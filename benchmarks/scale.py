@@ -39,7 +39,7 @@ def written(path: Path, pairs: int) -> None:
         pair = pa.array([f"p{k}" for k in range(begin, begin + count)]).take(pa.array(np.repeat(np.arange(count), 16)))
         values = [(c[:count] + 1e-4 * rng.normal(size=(count, 16))).ravel() for c in coordinates]
         table = pa.table({"pair": pair, "point": point[: 16 * count], **dict(zip(names, values, strict=True))})
-        writer = writer or pq.ParquetWriter(path, table.schema, use_dictionary=["pair", "point"])
+        writer = writer or pq.ParquetWriter(path, table.schema, **parquet.encoding(table.schema))
         writer.write_table(table)
     if writer:
         writer.close()

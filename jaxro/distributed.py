@@ -46,7 +46,7 @@ def on_ray(job: Job, told: Callable[[int], None]) -> Iterator[dict[str, Any]]:
     if not job.left:
         return
     if not ray.is_initialized():
-        ray.init(address=os.environ.get("RAY_ADDRESS"), log_to_driver=False, logging_level="warning")
+        ray.init(address=os.environ.get("RAY_ADDRESS"), log_to_driver=False, logging_level=logging.WARNING)
     ray.data.DataContext.get_current().enable_progress_bars = False
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     having = ray.cluster_resources()

@@ -60,7 +60,7 @@ def prepared(options: Options, large: Large, procedure: tuple[str, AbstractProce
     _check(options.out, folder, options.force, large.resume)
     try:
         job = _planned(options, large, procedure, chosen, folder)
-        job.go_on() if large.resume else job.begin()
+        job.go_on() if large.resume and job.begun else job.begin()
     except TableError:
         if not large.resume:
             shutil.rmtree(folder, ignore_errors=True)

@@ -245,7 +245,7 @@ def converted(source: Path, target: Path) -> None:
         )
         writer = None
         for batch in reader:
-            writer = writer or pq.ParquetWriter(draft, batch.schema, **_encoding(batch.schema))
+            writer = writer or pq.ParquetWriter(draft, batch.schema, **encoding(batch.schema))
             _check(batch)
             writer.write_batch(batch)
         if writer is None:
@@ -279,10 +279,11 @@ def _careful(path: Path) -> Iterator[tuple]:
 
 
 def write(table: Any, path: Path) -> None:
-    """A Parquet file; only names are worth a dictionary."""
-    pq.write_table(table, path, **_encoding(table.schema))
+    """The table as a Parquet file."""
+    pq.write_table(table, path, **encoding(table.schema))
 
 
-def _encoding(schema: Any) -> dict[str, Any]:
+def encoding(schema: Any) -> dict[str, Any]:
+    """How tables are written: only names are worth a dictionary."""
     repeated = [f.name for f in schema if not (pa.types.is_floating(f.type) or pa.types.is_boolean(f.type))]
     return {"use_dictionary": repeated, "compression": "snappy"}

@@ -126,6 +126,11 @@ def names_of(numbers: np.ndarray, names: dict[int, str]) -> Any:
     return pa.DictionaryArray.from_arrays(pa.array(numbers.astype(np.int8)), known)
 
 
+def where(values: np.ndarray, there: np.ndarray) -> Any:
+    """An Arrow column, null where the value is not `there`."""
+    return pa.array(values, mask=~there)
+
+
 def _column(values: Any) -> Any:
     """An Arrow column, null where the value is NaN (or, of a small integer for yes and no, negative)."""
     if not isinstance(values, np.ndarray):

@@ -168,7 +168,7 @@ def element_values(found: AbstractElements, cofactor: Array, sigma0: Array) -> t
 
     zero = (jnp.zeros_like(sigma0),) * 5
     jacobian = jax.jacfwd(values, argnums=tuple(range(5)))(*zero)
-    variance = lambda row: sum(row[i] * row[j] * cofactor[i, j] for i in range(5) for j in range(5))
+    variance = lambda row: sum((row[i] * row[j] * cofactor[i, j] for i in range(5) for j in range(5)), zero[0])
     angles = (False,) * 3 + (True,) * 3
     return degrees(values(*zero), angles), degrees([sigma0 * root(variance(row)) for row in jacobian], angles)
 

@@ -120,7 +120,7 @@ class Worker:
     def _cleaned(self, table: Any, rows: dict[str, Any], decided: dict[str, np.ndarray], q: np.ndarray) -> Any:
         """Every row of the input with its verdict."""
         measured = {name: table.column(name) for name in table.column_names if name not in rows}
-        order = np.where(decided["kept"], -1, decided["order"]).astype(np.int32)
+        order = records.where(decided["order"].astype(np.int32), ~decided["kept"])
         verdict = {"kept": decided["kept"], "order": order, "statistic": decided["statistic"]}
         return records.table({**rows, **measured}, verdict | {"limit": decided["limit"], "q": q}, self._work.units)
 
@@ -171,6 +171,11 @@ class Job:
     def done(self) -> int:
         """Pairs in finished parts."""
         return sum(entry["pairs"] for entry in self.entries)
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is a journal."""
+        return (self.work.folder / JOURNAL).exists()
 
     def begin(self) -> None:
         """A new journal. Raises TableError where the folder cannot be written."""
