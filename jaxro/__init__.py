@@ -14,6 +14,8 @@ from . import (
     budget as budget,
     coplanarity as coplanarity,
     critical_values as critical_values,
+    height_accuracy as height_accuracy,
+    heights as heights,
     layout_design as layout_design,
     losses as losses,
     propagation as propagation,
