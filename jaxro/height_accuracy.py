@@ -1,7 +1,7 @@
-"""Expected standard deviations of heights over a grid: the closed forms of Gutkin (1982), and exact budgets by autodiff.
+"""Expected standard deviations of heights over a grid: closed forms of Gutkin (1982), and exact budgets by autodiff.
 
-The closed forms are kept as printed; each docstring says how far it is from the exact propagation through the formulas of
-`heights`, which `propagation.propagate_each` and `budget` give. Lengths in one unit; arrays broadcast.
+The closed forms are kept as printed; each docstring says how far it is from the exact propagation through the formulas
+of `heights`, which `propagation.propagate_each` and `budget` give. Lengths in one unit; arrays broadcast.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,6 @@ from jaxtyping import ArrayLike, PyTree
 
 from .adjustment import root
 from .heights import Number
-from .propagation import propagate_each
 from .reductions import total
 
 
@@ -113,7 +112,7 @@ def grid_parallax_deviation(
 ) -> Number:
     """(8): p_c sqrt((m_B / B)² + (m_l / l)² + (m_L / L)²). Exact to first order."""
     parts = ((m_base, base), (m_photo_side, photo_side), (m_side, side))
-    return p_c * root(sum(((jnp.asarray(m, float) / of) ** 2 for m, of in parts), jnp.zeros(())))
+    return jnp.asarray(p_c, float) * root(sum(((jnp.asarray(m, float) / of) ** 2 for m, of in parts), jnp.zeros(())))
 
 
 def by_readings(camera_height: ArrayLike, p_c: ArrayLike, m_dp: ArrayLike) -> Number:
@@ -196,12 +195,11 @@ def budget(function: Callable, values: PyTree, deviations: PyTree) -> Budget:
 
     `values` and `deviations` as in `propagation.propagate_each`, whose result `deviation` is.
     """
-    numbers, structure = jax.tree.flatten(deviations)
-    parts = []
-    for k in range(len(numbers)):
-        alone = [m if i == k else jnp.zeros_like(jnp.asarray(m, float)) for i, m in enumerate(numbers)]
-        parts.append(propagate_each(function, values, jax.tree.unflatten(structure, alone)))
-    return Budget(root(sum((p**2 for p in parts), jnp.zeros(()))), jax.tree.unflatten(structure, parts))
+    arrays = jnp.broadcast_arrays(*(jnp.asarray(a, float) for a in jax.tree.leaves((values, deviations))))
+    values, deviations = jax.tree.unflatten(jax.tree.structure((values, deviations)), arrays)
+    slopes = jax.grad(lambda numbers: jnp.sum(function(numbers)))(values)  # element by element: no one feels another
+    parts = jax.tree.map(lambda slope, s: jnp.abs(slope) * s, slopes, deviations)
+    return Budget(root(sum((p**2 for p in jax.tree.leaves(parts)), jnp.zeros(()))), parts)
 
 
 def _share(part: Number, whole: Number) -> Number:

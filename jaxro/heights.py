@@ -8,8 +8,8 @@ with dp the horizontal parallax read at a point less that read at the grid there
 grid, B their base, L a side of the square and l its length on the photo. Lengths in one unit; every function is the
 formula for single numbers and takes arrays that broadcast together.
 
-(1) holds for tilted photos as well, where l and the parallax of the grid are those at the point: on the photo whose mark
-moves, the right one here, a height displaces the point by the picture of B h / (H - h), whatever its tilt.
+(1) holds for tilted photos as well, where l and the parallax of the grid are those at the point: on the photo whose
+mark moves, the right one here, a height displaces the point by the picture of B h / (H - h), whatever its tilt.
 """
 
 from typing import NamedTuple

@@ -1,11 +1,11 @@
 """Heights over a grid: formulas against the geometry of two cameras, errors against draws and the printed figures."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxro import height_accuracy as accuracy, heights
+from jaxro import height_accuracy as accuracy, height_planning as planning, heights
+from jaxro.experiments import gutkin1982
 from jaxro.heights import Sight, Square, Station
 from jaxro.propagation import propagate_each
 
@@ -116,7 +116,7 @@ def test_closed_forms_of_a_height_are_the_propagation():
 
 
 def test_closed_forms_of_a_difference_are_the_propagation_but_for_dp_beside_p_c():
-    """(7), (9) against (5) with its p_c in common: 11 % too small for dp = -1, p_c = 17.5; the table's variant 0.4 %."""
+    """(7), (9) against (5), p_c in common: 11 % too small for dp = -1, p_c = 17.5; the table's variant 0.4 %."""
     one_p_c = lambda v: heights.difference_in_square(v[0], v[1], DP + 0.1, v[2])
     dh = float(one_p_c((H, P_C, DP)))
     exact = propagate_each(one_p_c, (H, P_C, DP), (10.0, 0.069, 0.0085))
@@ -128,3 +128,81 @@ def test_closed_forms_of_a_difference_are_the_propagation_but_for_dp_beside_p_c(
     np.testing.assert_allclose(accuracy.by_base(H, 75.0, 17.5 * H / 75, 0.0085), reading, rtol=1e-12)
     flat = propagate_each(lambda dp: heights.difference_in_square(H, P_C, 0.0, dp), 0.0, 0.0085)
     np.testing.assert_allclose(flat, reading, rtol=1e-12)  # (9) is exact at the grid
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return gutkin1982.run()
+
+
+def test_every_cell_of_the_table_has_its_printed_digit_but_for_the_misprints(paper):
+    """Those named are no more and no fewer than those that differ, and totals are those of the printed terms."""
+    differing = set()
+    for number, case in enumerate(gutkin1982.CASES):
+        for row in gutkin1982.ROWS:
+            last = 0.001 if row == "m_pc" else 0.1
+            off = np.abs(paper.cells[number, row] - np.array(case.printed[row])) > last / 2 + 1e-12
+            differing |= {(number, row, int(column)) for column in np.flatnonzero(off)}
+        terms = [case.printed[row] for row in ("readings", "camera height", "grid parallax")]
+        np.testing.assert_allclose(np.sqrt(np.sum(np.square(terms), axis=0)), case.printed["total"], atol=0.05)
+    misprints = {(0, "m_pc", 0), (0, "m_pc", 2), (0, "readings", 3), (0, "total", 3)}  # named with the paper
+    others = {(1, "readings", 2), (1, "readings", 3), (1, "grid parallax", 0), *((1, "total", k) for k in range(3))}
+    assert differing == misprints | others == set(gutkin1982.MISPRINTS)
+    # what stands behind the last of them
+    np.testing.assert_allclose(accuracy.height_terms(1500.0, 7.5, -0.8, 200.0, 0.007, 10.0, 0.02)[2], 0.6, atol=0.05)
+    np.testing.assert_allclose(1500 * 0.0085 / (7.5 - 1.6 + 0.64 / 7.5), 2.1, atol=0.05)
+    assert paper.cells[1, "readings"][3] > 0.745
+
+
+def test_figures_of_the_text():
+    """(8), (11'), (11''), (16'), (17), (18) and (20) as calculated by hand from the paper's own numbers."""
+    found = {}
+    for figure in gutkin1982.figures():
+        found.setdefault(figure.what.split()[0], []).append(figure.found)
+    np.testing.assert_allclose(found["(8)"][-2:], [0.030, 0.048], atol=5e-4)
+    np.testing.assert_allclose(found["(11')"], 75 / 0.0085, rtol=1e-12)
+    np.testing.assert_allclose(found["(11'')"], 2206, atol=0.5)
+    np.testing.assert_allclose(found["(16')"], [1.2247, 1.0], atol=5e-5)
+    np.testing.assert_allclose(found["exact,"], [1.0, 0.8660], atol=5e-5)
+    np.testing.assert_allclose(found["(17),"], 2000, atol=6)
+    np.testing.assert_allclose(found["(20)"], [5386, 1346], atol=0.6)
+    for figure in gutkin1982.figures():
+        far = abs(figure.found - figure.printed) > 0.5 * 10**-figure.digits + 1e-9
+        assert not far or figure.remark, figure
+
+
+def test_an_error_of_the_camera_height_is_in_heights_not_in_differences(paper):
+    (h, dh), (h_wrong, dh_wrong) = paper.experiment
+    depth = gutkin1982.EXPERIMENT_DEPTH
+    assert 60 < depth < 75
+    larger = 30 / 2100  # everything is larger by as much: heights by it of their depth
+    np.testing.assert_allclose(h_wrong**2, (h * (1 + larger)) ** 2 + larger**2 * (depth**2 + 50), rtol=0.02)
+    assert h_wrong / h > 1.2 and dh_wrong / dh < 1.025
+    # the paper's own: 1.48 to 1.76, and 1.40 both times
+    np.testing.assert_allclose(h_wrong - h, 1.76 - 1.48, atol=0.05)
+
+
+def test_a_plan_tells_what_the_paper_expects_and_what_draws_show(draws):
+    """Its case H = 3500, B max; and the scene of the draws."""
+    plan = planning.Plan(75.0, 3500.0, 3500 / 4, depth=200.0, legs=9, traverses=3)
+    told = planning.expected(plan, planning.Deviations(grid=0.0057))  # with the point's 4 µm the 7 µm of the table
+    np.testing.assert_allclose(told.height, 1.78, atol=0.05)
+    np.testing.assert_allclose(told.middle, 1.5 * told.difference, rtol=1e-12)
+    np.testing.assert_allclose(told.node, told.difference * np.sqrt(3.0), rtol=1e-12)
+    assert told.in_square < told.difference
+    spent = planning.height_budget(plan, planning.Deviations()).shares[0].camera_height
+    assert 0.05 < spent < 0.5
+
+
+def test_a_plan_answers_the_inverse_question():
+    plan, sd = planning.Plan(75.0, 3500.0, 500.0), planning.Deviations()
+    of = lambda expected: expected.difference
+    base = planning.base_needed(plan, sd, 2.5, of)
+    np.testing.assert_allclose(of(planning.expected(plan._replace(base=base), sd)), 2.5, rtol=1e-9)
+    assert np.isinf(planning.base_needed(plan, sd, 0.5, of))
+    assert np.isinf(planning.base_needed(plan, sd._replace(camera_height=50.0), 2.5, lambda e: e.height))
+    for fixed_ratio in (True, False):
+        high = planning.camera_height_allowed(plan, sd, 1.5, of, fixed_ratio=fixed_ratio)
+        moved = plan._replace(camera_height=high, base=500.0 / 3500 * high if fixed_ratio else 500.0)
+        np.testing.assert_allclose(of(planning.expected(moved, sd)), 1.5, rtol=1e-9)
+        assert planning.camera_height_allowed(plan, sd, 0.01, of, fixed_ratio=fixed_ratio) == 0
