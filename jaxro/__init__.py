@@ -20,6 +20,7 @@ from . import (
     layout_design as layout_design,
     levelling as levelling,
     losses as losses,
+    mock_surveys as mock_surveys,
     propagation as propagation,
     rejection as rejection,
     reliability as reliability,
@@ -27,6 +28,7 @@ from . import (
     sensitivity as sensitivity,
     simulation as simulation,
     starts as starts,
+    surveys as surveys,
     variance_components as variance_components,
 )
 from .adjustment import Adjustment as Adjustment, adjust as adjust
