@@ -1,8 +1,9 @@
 """What accuracy a survey over a grid will have, before it is made, and what base or camera height a wanted one needs.
 
-Errors are those of exact propagation through `heights` at the planned geometry, for legs that are each read anew. A
-traverse takes its legs as independent, as the paper does: what squares and cameras add to two legs in common cancels at
-the point between them, so that this is on the safe side.
+Errors are those of exact propagation through `heights` at the planned geometry. In traverses the points are read anew
+for each leg, the grid once in each square, as `surveys` takes it: of a leg only the readings of its points add up,
+while what squares and grid do to a point is in both legs that meet there and cancels but at the ends. The paper's (13)
+and (16), in `height_accuracy`, let everything add up.
 """
 
 from collections.abc import Callable
@@ -12,7 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import ArrayLike
 
-from .height_accuracy import Budget, budget, detail_deviation, middle_deviation
+from .adjustment import root
+from .height_accuracy import Budget, budget
 from .heights import Number, Sight, Square, Station, sighted, sighted_difference
 
 LARGEST_BASE = 0.25
@@ -108,16 +110,19 @@ def in_square_budget(plan: Plan, deviations: Deviations) -> Budget:
 
 def expected(plan: Plan, deviations: Deviations) -> Expected:
     """The accuracy to expect. All numbers may be arrays that broadcast."""
-    difference = difference_budget(plan, deviations).deviation
+    between = difference_budget(plan, deviations)
     in_square = in_square_budget(plan, deviations).deviation
-    legs = jnp.asarray(plan.legs, float)
+    legs, traverses = jnp.asarray(plan.legs, float), jnp.asarray(plan.traverses, float)
+    read = between.parts[1].point ** 2 + between.parts[2].point ** 2
+    ends = between.deviation**2 - read  # of two points; from two known ones, or k, that of these is divided
+    middle = root(read * legs / 4 + ends * (1 + 1 / 2) / 2)
     return Expected(
         height_budget(plan, deviations).deviation,
-        difference,
+        between.deviation,
         in_square,
-        middle_deviation(difference, legs),
-        difference * jnp.sqrt(legs / plan.traverses),
-        detail_deviation(difference, legs, in_square),
+        middle,
+        root(read * legs / traverses + ends * (1 + 1 / traverses) / 2),
+        root(middle**2 + in_square**2),
     )
 
 

@@ -1,10 +1,11 @@
 """Heights over a grid: formulas against the geometry of two cameras, errors against draws and the printed figures."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxro import height_accuracy as accuracy, height_planning as planning, heights
+from jaxro import height_accuracy as accuracy, height_planning as planning, heights, surveys
 from jaxro.experiments import gutkin1982
 from jaxro.heights import Sight, Square, Station
 from jaxro.propagation import propagate_each
@@ -182,16 +183,42 @@ def test_an_error_of_the_camera_height_is_in_heights_not_in_differences(paper):
     np.testing.assert_allclose(h_wrong - h, 1.76 - 1.48, atol=0.05)
 
 
-def test_a_plan_tells_what_the_paper_expects_and_what_draws_show(draws):
-    """Its case H = 3500, B max; and the scene of the draws."""
-    plan = planning.Plan(75.0, 3500.0, 3500 / 4, depth=200.0, legs=9, traverses=3)
+def test_a_plan_tells_what_the_paper_expects_and_what_a_survey_has():
+    """Its case H = 3500, B max; and a mock survey of one traverse between two known points."""
+    plan = planning.Plan(75.0, 3500.0, 3500 / 4, depth=200.0)
     told = planning.expected(plan, planning.Deviations(grid=0.0057))  # with the point's 4 µm the 7 µm of the table
     np.testing.assert_allclose(told.height, 1.78, atol=0.05)
-    np.testing.assert_allclose(told.middle, 1.5 * told.difference, rtol=1e-12)
-    np.testing.assert_allclose(told.node, told.difference * np.sqrt(3.0), rtol=1e-12)
-    assert told.in_square < told.difference
-    spent = planning.height_budget(plan, planning.Deviations()).shares[0].camera_height
-    assert 0.05 < spent < 0.5
+    assert told.in_square < told.difference < told.middle < told.detail
+
+    n, count, sd = 8, 9, planning.Deviations()
+    plan = planning.Plan(75.0, 2100.0, 400.0, depth=150.0, step=0.0, legs=n)
+    sight = planning.sight(plan, plan.depth)
+    same = lambda value, size: jnp.full(size, value, float)
+    reading = sight.point
+    measured = surveys.Measured(
+        jnp.asarray(2100.0),
+        jnp.asarray(400.0),
+        *(same(a, count) for a in (100.0, sight.square.photo_side, 0.0, reading)),
+        same(reading, n),
+        same(reading, n),
+    )
+    place = np.arange(count)
+    survey = surveys.survey(
+        measured,
+        surveys.Measured(
+            *map(jnp.asarray, (sd.camera_height, sd.base, sd.side, sd.photo_side, sd.grid, *[sd.point] * 3))
+        ),
+        square=place,
+        grid=place,
+        datum=np.zeros(count),
+        known=np.isin(place, (0, n)),
+        height=np.where(np.isin(place, (0, n)), -150.0, 0.0),
+        start=place[:-1],
+        end=place[1:],
+    )
+    np.testing.assert_allclose(
+        surveys.solve(survey).deviations.value[n // 2], planning.expected(plan, sd).middle, rtol=1e-6
+    )
 
 
 def test_a_plan_answers_the_inverse_question():
