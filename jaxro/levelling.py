@@ -17,11 +17,13 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.ops import segment_sum
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import critical_values as critical
 from .adjustment import Adjustment, adjust, root
+from .reductions import total
 from .reliability import UNTESTABLE
 from .results import RESULTS
 
@@ -113,14 +115,19 @@ def adjust_heights(
     fixed = known[network.fixed]
     observations = network.first, network.last, whole
 
+    held = lax.stop_gradient(fixed)
+
     def condition(free, observation):
         first, last, rise = observation
-        nodes = jnp.concatenate([free, fixed])
+        nodes = jnp.concatenate([free, held])
         return nodes[last] - nodes[first] - rise
 
     start = jnp.broadcast_to(fixed[0], network.free.shape)
-    solved = adjust(condition, start, observations, (None, None, whole_q))
-    nodes = jnp.concatenate([solved.parameters, fixed])
+    solved = lax.stop_gradient(
+        adjust(condition, *lax.stop_gradient((start, observations)), (None, None, lax.stop_gradient(whole_q)))
+    )
+    free, cofactor = _refined(network, solved, whole, whole_q, fixed)
+    nodes = jnp.concatenate([free, fixed])
     w = nodes[network.last] - nodes[network.first] - whole
 
     before = jnp.cumsum(together(jnp.ones_like(rise))).astype(int)[network.traverse] - 1
@@ -130,13 +137,15 @@ def adjust_heights(
     inner = nodes[network.first][network.traverse] + done + part * w[network.traverse]
     heights = jnp.where(network.known, known, 0.0).at[network.after].set(inner).at[network.nodes].set(nodes)
 
-    cofactor = _cofactor(solved, fixed.shape[0])
     a, b = network.first[network.traverse], network.last[network.traverse]
     inner_q = (1 - part) ** 2 * cofactor[a, a] + part**2 * cofactor[b, b] + 2 * part * (1 - part) * cofactor[a, b]
     inner_q = inner_q + done_q * (1 - part)
     squares = jnp.zeros_like(heights).at[network.after].set(inner_q).at[network.nodes].set(jnp.diagonal(cofactor))
 
-    r = solved.redundancy
+    first, last = network.first, network.last
+    r = 1 - (cofactor[first, first] + cofactor[last, last] - 2 * cofactor[first, last]) / whole_q
+    checked = solved.degrees_of_freedom > 0
+    variance = total(w**2 / whole_q) / jnp.where(checked, solved.degrees_of_freedom, 1).astype(w.dtype)
     testable = r > UNTESTABLE
     safe = jnp.where(testable, r, 1.0)
     share = q / whole_q[network.traverse]
@@ -153,7 +162,7 @@ def adjust_heights(
         jnp.where(testable, critical.delta_normal(level, power) * jnp.sqrt(whole_q / safe), jnp.inf),
         back(network.turned * share * w[network.traverse]),
         back(share * r[network.traverse]),
-        solved.sigma0,
+        jnp.where(checked, root(variance), jnp.nan),
         solved.degrees_of_freedom,
         critical.normal(level),
         solved.result,
@@ -165,9 +174,21 @@ def _within(running: Array, end: Int[Array, " leg"], whole: Array) -> Array:
     return running - running[end] + whole
 
 
-def _cofactor(solved: Adjustment, fixed: int) -> Float[Array, "node node"]:
-    """That of all nodes: zero for the known ones."""
-    return jnp.pad(solved.cofactor, ((0, fixed), (0, fixed)))
+def _refined(
+    network: Network, solved: Adjustment, whole: Array, q: Array, fixed: Array
+) -> tuple[Float[Array, " free"], Float[Array, "node node"]]:
+    """The free heights and the cofactor of all nodes (zero for known ones), each a Newton step from the solution.
+
+    x + Q Aᵀ P (D - A x) and 2 Q - Q N Q change nothing there, and have the derivatives of the solution by everything
+    measured; those through the solver would hold a callback, with which a compiled program cannot be stored.
+    """
+    nodes = jnp.arange(network.free.shape[0] + fixed.shape[0])[None, :]
+    every = jnp.where(network.last[:, None] == nodes, 1.0, 0.0) - jnp.where(network.first[:, None] == nodes, 1.0, 0.0)
+    a = every[:, : network.free.shape[0]]
+    rest = whole - every @ jnp.concatenate([solved.parameters, fixed])
+    cofactor = 2 * solved.cofactor - solved.cofactor @ (a.T @ (a / q[:, None])) @ solved.cofactor
+    free = solved.parameters + solved.cofactor @ (a.T @ (rest / q))
+    return free, jnp.pad(cofactor, ((0, fixed.shape[0]), (0, fixed.shape[0])))
 
 
 def unconnected(start: Places, end: Places, known: Flags) -> np.ndarray:

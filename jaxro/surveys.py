@@ -75,7 +75,8 @@ class Surveyed(eqx.Module):
     """A finished survey: heights and misclosures, their standard deviations, and the part of every source in the
     variances of the heights (of 1; fields (point,)). `w` of every traverse is its misclosure in its own standard
     deviation, `detectable` the least error of one of its legs that this test finds with its power, as in
-    `levelling.Levelled`, whose numbers for the readings alone are in `adjusted` (None without legs)."""
+    `levelling.Levelled`, whose numbers for the readings alone are in `adjusted` (None without legs); `leg_deviations`
+    are those of the legs by these readings."""
 
     heights: Heights
     deviations: Heights
@@ -83,6 +84,7 @@ class Surveyed(eqx.Module):
     w: Float[Array, "*batch traverse"]
     detectable: Float[Array, "*batch traverse"]
     limit: Float[Array, "*batch"]
+    leg_deviations: Float[Array, "*batch leg"]
     adjusted: Levelled | None
 
 
@@ -194,11 +196,11 @@ def _solved(survey: Survey, level: float, power: float) -> Surveyed:
     shares = Measured(*(jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), 0.0) for part in parts[0]))
     limit, delta = critical.normal(level), critical.delta_normal(level, power)
     if adjusted is None:
-        return Surveyed(value, deviations, shares, jnp.zeros(0), jnp.zeros(0), limit, None)
+        return Surveyed(value, deviations, shares, jnp.zeros(0), jnp.zeros(0), limit, jnp.zeros(0), None)
     there, spread = adjusted.testable, deviations.misclosure
     w = jnp.where(there, value.misclosure / jnp.where(there, spread, 1.0), 0.0)
     detectable = jnp.where(there, delta * spread / jnp.where(there, adjusted.redundancy, 1.0), jnp.inf)
-    return Surveyed(value, deviations, shares, w, detectable, limit, adjusted)
+    return Surveyed(value, deviations, shares, w, detectable, limit, jnp.sqrt(variances), adjusted)
 
 
 def _squares(slopes: Array, deviations: Array) -> Array:

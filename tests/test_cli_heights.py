@@ -46,8 +46,9 @@ def survey(readings, grid, traverses=None, *options):
     return run("heights", readings, "--grid", grid, *legs, *CAMERAS, *options)
 
 
-def test_heights_of_the_example_are_true_within_their_deviations(tables, tmp_path):
-    """Written, read again, and held against the surface that was photographed; without a file it is the same."""
+def test_heights_of_the_example_are_true_within_their_deviations(tables, tmp_path, monkeypatch):
+    """Written, read again, and held against the surface that was photographed; without a file, by a program that is
+    kept, it is the same."""
     pytest.importorskip("matplotlib")
     out = tmp_path / "out"
     told = survey(*tables, "--out", out)
@@ -70,7 +71,9 @@ def test_heights_of_the_example_are_true_within_their_deviations(tables, tmp_pat
     assert summary["degrees_of_freedom"] == 3 and summary["suspicious"] == []
     legs = rows(out / "legs.csv")
     assert len(legs) == example.TRAVERSES.count("\n") - 1
+    monkeypatch.setenv("JAXRO_CACHE", str(tmp_path / "kept"))
     known = run("heights")
+    assert len(list((tmp_path / "kept").iterdir())) == 1
     assert known.exit_code == 0 and words(told.stdout).split(" Written to ")[0].split("H 1505")[1] in words(
         known.stdout
     )

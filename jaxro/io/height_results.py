@@ -8,8 +8,10 @@ import jax
 import numpy as np
 
 from .. import surveys
+from ..results import RESULTS
 from . import files
 from .height_tables import Named
+from .tables import TableError
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,12 @@ class Done:
 
 
 def finished(named: Named) -> Done:
-    """The survey calculated."""
+    """The survey calculated. Raises TableError where the network of its traverses has no solution."""
     found = jax.tree.map(np.asarray, surveys.solve(named.survey))
+    adjusted = found.adjusted
+    if adjusted is not None and int(adjusted.result._value) != int(RESULTS.successful._value):
+        advice = RESULTS[adjusted.result] or "no solution"
+        raise TableError("traverses", None, None, advice, "traverses that determine their points")
     one = jax.tree.map(np.asarray, named.survey)
     levelled, support, origin = set(one.levelled.tolist()), one.support, []
     for i in range(named.points):
@@ -106,7 +112,7 @@ def _closures(named: Named, one, found: surveys.Surveyed) -> list[Closure]:
         return []
     height, result = np.asarray(found.heights.value), []
     rises = height[one.end] - height[one.start] - found.adjusted.corrections
-    variances = np.asarray(surveys.leg_variances(named.survey))
+    variances = np.square(found.leg_deviations)
     for name in dict.fromkeys(named.traverses):
         legs = [k for k, other in enumerate(named.traverses) if other == name]
         first, last = one.start[legs[0]], one.end[legs[-1]]
