@@ -103,8 +103,8 @@ def adjust_heights(
     """Heights of all points from `rises` of the legs with their `variances`; `known`: heights (point,), used where the
     network has them known. `level` and `power` of the test of a traverse, as in `reliability.assess`.
 
-    Works under jit, vmap and grad. A program is compiled for every number of nodes: a second for a few, half a minute
-    for 40.
+    Works under jit, vmap and grad. A program is compiled for every number of nodes: seconds for a few, half a
+    minute for 30 free ones.
     """
     known = jnp.asarray(known, float)
     rise = network.turned * jnp.asarray(rises, float)[network.leg]

@@ -127,7 +127,9 @@ def _needed(options: Options, plan: Plan, deviations: Deviations, want: float) -
     longest = planning.LARGEST_BASE * options.camera_height
     best = float(of(planning.expected(plan._replace(base=longest), deviations)))
     if not np.isfinite(base) and not any(highest.values()):
-        expected = f"at least {best:.2f} mm, that of the largest base at this camera height, or better readings (--sd)"
+        expected = (
+            f"a larger one (± {best:.2f} mm with the largest base at this camera height), or better readings (--sd)"
+        )
         raise TableError("--want", None, None, f"{what}, which no base and no camera height gives", expected)
     lines = [f"For {what}:"]
     if np.isfinite(base):

@@ -103,8 +103,8 @@ def _mind(console: Console, done: Done) -> None:
         also = f" {rest} more exceed{'s' * (rest == 1)} the limit, perhaps by the same error." if rest else ""
         console.print(
             f"[red]Mind:[/red] Traverse {escape(named)} has |w| = {worst_w:.1f} where "
-            f"{float(done.found.limit):.2f} is allowed: one of its legs is wrong by some {sizes} mm, which cannot be "
-            f"told from the misclosure. Read its legs again.{also}"
+            f"{float(done.found.limit):.2f} is allowed: one of its legs is wrong by some {sizes} mm, the misclosure "
+            f"cannot tell which. Read them again.{also}"
         )
     unchecked = [f"{t.names} ({t.first} - {t.last})" for t in done.traverses if not np.isfinite(t.detectable)]
     if unchecked:
