@@ -14,8 +14,13 @@ from . import (
     budget as budget,
     coplanarity as coplanarity,
     critical_values as critical_values,
+    height_accuracy as height_accuracy,
+    height_planning as height_planning,
+    heights as heights,
     layout_design as layout_design,
+    levelling as levelling,
     losses as losses,
+    mock_surveys as mock_surveys,
     propagation as propagation,
     rejection as rejection,
     reliability as reliability,
@@ -23,6 +28,7 @@ from . import (
     sensitivity as sensitivity,
     simulation as simulation,
     starts as starts,
+    surveys as surveys,
     variance_components as variance_components,
 )
 from .adjustment import Adjustment as Adjustment, adjust as adjust

@@ -7,7 +7,14 @@ papers are in REPRODUCTIONS.
 from collections.abc import Callable
 from typing import NamedTuple
 
-from . import burshtynskaya1989, burshtynskaya1989_tables, dorozhinsky1971, dorozhinsky1971_tables
+from . import (
+    burshtynskaya1989,
+    burshtynskaya1989_tables,
+    dorozhinsky1971,
+    dorozhinsky1971_tables,
+    gutkin1982,
+    gutkin1982_tables,
+)
 
 
 class Reproduction(NamedTuple):
@@ -24,5 +31,6 @@ REPRODUCTIONS: dict[str, Reproduction] = {
     "burshtynskaya1989": Reproduction(
         burshtynskaya1989.run, burshtynskaya1989_tables.tables, True, burshtynskaya1989.VARIANTS
     ),
+    "gutkin1982": Reproduction(gutkin1982.run, gutkin1982_tables.tables, False),
 }
 """By the name on the command line."""

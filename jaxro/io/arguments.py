@@ -93,6 +93,39 @@ Minimised = Annotated[Residual, typer.Option(help="What is minimised: whitened c
 Unit = Annotated[str, typer.Option(help="Name of the photo unit in reports: mm, px.", metavar="NAME")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite the files in a folder that is not empty.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.", metavar="S")]
+
+GridTable = Annotated[
+    Path | None,
+    typer.Option(
+        help="The squares: square,side,photo_side (mm; on the right photo), optionally parallax (the grid read there), "
+        "height.",
+        metavar="GRID.csv",
+        show_default=False,
+    ),
+]
+TraverseTable = Annotated[
+    Path | None,
+    typer.Option(
+        help="Legs in order, each read anew: traverse,from,to,back,fore; a square's name is its corner.",
+        metavar="FILE.csv",
+        show_default=False,
+    ),
+]
+CameraHeight = Annotated[
+    float | None, typer.Option(help="Of both cameras over the grid, mm.", metavar="H", show_default=False)
+]
+HorizontalBase = Annotated[
+    float | None, typer.Option(help="Horizontal distance of the cameras, mm.", metavar="B", show_default=False)
+]
+Deviation = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sd",
+        help="A standard deviation in mm, as often as wanted; an unknown NAME lists them with their defaults.",
+        metavar="NAME=VALUE",
+        show_default=False,
+    ),
+]
 Tables = Annotated[
     str | None,
     typer.Option(

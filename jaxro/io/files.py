@@ -11,6 +11,7 @@ import json
 import math
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ def texts(solved: list[Solution], units: Units, summary: dict[str, Any]) -> dict
     }
 
 
-def write(directory: Path, texts: dict[str, str]) -> None:
+def write(directory: Path, texts: Mapping[str, str | bytes]) -> None:
     """All files by name, first complete in a folder beside `directory`, then renamed into place.
 
     Raises TableError, with nothing written, where the disk refuses.
@@ -47,7 +48,7 @@ def write(directory: Path, texts: dict[str, str]) -> None:
     try:
         draft.mkdir(parents=True)
         for name, text in texts.items():
-            (draft / name).write_text(text, encoding="utf-8", newline="")
+            (draft / name).write_bytes(text if isinstance(text, bytes) else text.encode())
         if directory.exists():
             for name in texts:
                 os.replace(draft / name, directory / name)
