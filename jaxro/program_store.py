@@ -11,6 +11,7 @@ import pickle
 import platform
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -67,7 +68,8 @@ def compiled(function: Callable, settings: dict[str, Any] | None, data: PyTree, 
         program = jax.jit(flat, compiler_options=settings).lower(*leaves).compile()
         # the structure itself cannot be pickled, but an object of that structure can
         like = jax.tree.unflatten(shapes_out[0], [0] * shapes_out[0].num_leaves)
-        _write(path, pickle.dumps((*serialize_executable.serialize(program), like)))
+        with suppress(Exception):  # a program that calls back into Python, such as a stock solver's, cannot be kept
+            _write(path, pickle.dumps((*serialize_executable.serialize(program), like)))
     else:
         program, like = stored
     out_structure = jax.tree.structure(like)
