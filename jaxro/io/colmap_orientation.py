@@ -1,0 +1,182 @@
+"""The orientation of image pairs from automatic matches, a good part of them wrong, photos in any position.
+
+1. A search by random subsets on at most SEARCHED matches, evenly taken: of eight points, solved linearly; where these
+   do not suffice or fit a plane, of five. It suffices when a better pose would have been met with the probability of
+   its `confidence`: many good points agree with wrong poses, too, so that their number alone does not prove a pose.
+2. All matches are judged anew by |w| at the familywise LEVEL, in turns with least squares. A match whose rays meet
+   behind a photo is wrong, unless they are parallel within their errors.
+3. The set that is left is believed if sets as good are not expected by accident (Moisan and Stival 2004):
+
+       C(n, k) C(k, 5) p^(k-5) (n - 5) < ACCIDENTS,
+
+   p the share of matches that agree when every point is given the partner of another one.
+"""
+
+import enum
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.special import gammaln
+from jaxtyping import Array, Bool, Float
+
+from .. import coplanarity, critical_values, rotations as rot
+from ..conditions import linearised
+from ..elements import RelativePose
+from ..normal_equations import accumulate, solve
+from ..orientation import orient
+from ..pairs import Pair, cleaned
+from ..reductions import count
+from ..rejection.hypotheses import EightPoint, FivePoint, moved_up, squares
+from ..rejection.ransac import Ransac
+from ..rejection.robust import agreeing, in_front
+from ..results import RESULTS, is_usable
+
+SEARCHED = 256
+EIGHT = Ransac(EightPoint(), count=128, confidence=0.99, limit=5.0)
+FIVE = Ransac(FivePoint(), count=1024, confidence=0.99, limit=5.0)
+"""Enough down to a third of right matches."""
+
+LEVEL = 0.01
+"""Probability that a pair without wrong matches loses one."""
+
+ROUNDS = 10
+SHIFTS = 8
+"""Other partners that each point is given."""
+
+ACCIDENTS = 1e-4
+PLANE = 0.8
+"""Share of the kept matches in a plane from which on that plane alone determines the pose."""
+
+
+class Kind(enum.IntEnum):
+    """How the orientation of a pair from its matches ended."""
+
+    oriented = 0
+    plane = 1
+    rotation = 2
+    weak = 3
+    no_consensus = 4
+    too_few = 5
+
+
+class Found(eqx.Module):
+    """Matches kept, the pose by them, n of the plane n · λ p1 = 1 nearest to them, and what that is worth."""
+
+    kept: Bool[Array, "*pairs match"]
+    pose: RelativePose
+    normal: tuple[Float[Array, "*pairs"], Float[Array, "*pairs"], Float[Array, "*pairs"]]
+    sigma0: Float[Array, "*pairs"]
+    kind: Array
+
+
+class Plane(NamedTuple):
+    """n, and the share of the points that lie in the plane."""
+
+    normal: rot.Vector
+    share: Float[Array, ""]
+
+
+def searched(pair: Pair, search: Ransac) -> tuple[RelativePose, Bool[Array, ""]]:
+    """The pose of most matches, and whether the search sufficed."""
+    pair = cleaned(pair)[0]
+    found = search.found(pair)
+    enough = (found.blocks * search.hypotheses.block).astype(found.enough.dtype) >= found.enough
+    if isinstance(search.hypotheses, EightPoint):  # which does not see the pose in a plane
+        use = pair.mask & (squares(pair, found.pose) <= search.limit**2)
+        enough = enough & (plane(pair, found.pose, use, search.limit).share < PLANE)
+    return found.pose, enough
+
+
+def judged(pair: Pair, pose: RelativePose, enough: Bool[Array, ""]) -> Found:
+    """All matches of a pair judged by the pose of a search."""
+    pair = cleaned(pair)[0]
+    each = lambda n: critical_values.normal(LEVEL / jnp.maximum(n, 1.0))
+    limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
+    pose, use = agreeing(pair, pose, pair.mask & (squares(pair, pose) <= 2 * limit**2), limit, ROUNDS)
+    use = use & (in_front(pair, pose) | parallel(pair, pose, limit))
+    solved = orient(pair.with_mask(use), start=pose)
+    pose, result = solved.pose, solved.result
+    normal, share = plane(pair, pose, use, limit)
+    kind = jnp.where(share < PLANE, int(Kind.oriented), int(Kind.plane))
+    # what lies behind a photo here is infinitely far for its errors
+    fair = is_usable(result) | (result == RESULTS.points_behind_camera)
+    believed = enough & (accidents(pair, pose, use, limit) < jnp.log(ACCIDENTS))
+    for holds, other in (
+        (~fair | ~believed, Kind.no_consensus),
+        (believed & (result == RESULTS.weakly_determined), Kind.weak),
+        (believed & (result == RESULTS.zero_base), Kind.rotation),
+        (count(pair.mask) < 6, Kind.too_few),
+    ):
+        kind = jnp.where(holds, int(other), kind)
+    return Found(use & (kind < Kind.no_consensus), pose, normal, solved.sigma0, kind)
+
+
+def parallel(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> Bool[Array, "match"]:
+    """The matches whose rays are parallel within `limit` standard deviations of the angle between them."""
+    rotation, base = pose.relative()
+
+    def one(point, sigma):
+        first, second, w2, *_ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
+        variance = sigma**2 * (1 / rot.dot(first, first) + 1 / rot.dot(second, second))
+        return w2 <= limit**2 * variance * rot.dot(first, first) * rot.dot(second, second)
+
+    return pair.mask & jax.vmap(one)(pair.coordinates, pair.sigma)
+
+
+def plane(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> Plane:
+    """The plane nearest to the points in use: n of 1/λ = n · p1, linear, in three turns in which points off it lose
+    their weight. A point lies in it if the homography p2 ~ Rᵀ (p1 - b (n · p1)) takes p1 to p2 within the limit."""
+    rotation, base = pose.relative()
+    back = rot.transpose(rotation)
+
+    def inverse_depth(point):
+        first, _, w2, lam, _ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
+        depth = lam * pair.focal_left
+        far = jnp.abs(depth) * 1e3 > w2  # not nearer than a thousandth of the base
+        return *(c / pair.focal_left for c in first), jnp.where(far, w2 / jnp.where(far, depth, 1.0), 0.0)
+
+    def squared(point, sigma, normal):
+        x1, y1, x2, y2 = point
+        p = (x1 / pair.focal_left, y1 / pair.focal_left, -jnp.ones_like(x1))
+        x, y, z = rot.apply(back, tuple(c - b * rot.dot(normal, p) for c, b in zip(p, base, strict=True)))
+        safe = jnp.where(z < 0, z, -1.0)
+        off = (pair.focal_right * x / -safe - x2) ** 2 + (pair.focal_right * y / -safe - y2) ** 2
+        return jnp.where(z < 0, off / (2 * sigma**2), jnp.inf)
+
+    *columns, target = jax.vmap(inverse_depth)(pair.coordinates)
+    errors = jax.vmap(squared, in_axes=(0, 0, None))
+
+    def turn(_, normal):
+        s = errors(pair.coordinates, pair.sigma, normal) / limit**2
+        weight = jnp.where(use, 1 / (1 + jnp.minimum(s, 1e6)), 0.0)
+        n, h, _ = accumulate([target], [[c] for c in columns], [weight])
+        return tuple(solve(n, h))
+
+    zero = jnp.zeros_like(pair.focal_left)
+    n, h, _ = accumulate([target], [[c] for c in columns], [jnp.where(use, 1.0, 0.0)])
+    normal = lax.fori_loop(0, 2, turn, tuple(solve(n, h)))
+    normal = tuple(jnp.where(jnp.isfinite(c), c, zero) for c in normal)
+    within = use & (errors(pair.coordinates, pair.sigma, normal) <= limit**2)
+    return Plane(normal, count(within) / jnp.maximum(count(use), 1.0))
+
+
+def accidents(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> Float[Array, ""]:
+    """Logarithm of the expected number of sets as good by accident."""
+    rows, n, k = moved_up(pair), count(pair.mask), count(use)
+    index = jnp.arange(rows.shape[0])
+    number = n.astype(index.dtype)
+    there = index < number
+
+    def shifted(i, agree):
+        step = 1 + i * jnp.maximum(number // SHIFTS, 1)
+        partner = (index + step) % jnp.maximum(number, 1)
+        others = rows.at[partner].get(mode="clip")
+        mixed = Pair(rows[:, 0], rows[:, 1], others[:, 2], others[:, 3], pair.sigma, there, pair.focal_left, pair.focal_right)
+        return agree + count(there & (squares(mixed, pose) <= limit**2))
+
+    p = (lax.fori_loop(0, SHIFTS, shifted, n * 0) + 1) / (SHIFTS * n + 2)
+    choices = gammaln(n + 1) - gammaln(n - k + 1) - gammaln(6.0) - gammaln(jnp.maximum(k, 5.0) - 4)
+    return jnp.where(k > 5, choices + (k - 5) * jnp.log(p) + jnp.log(jnp.maximum(n - 5, 1.0)), jnp.inf)
