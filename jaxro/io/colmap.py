@@ -9,7 +9,7 @@ b of unit length, n · X = 1 the plane. F and H hold for keypoints free of disto
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,12 +17,11 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import Console
 
-from ..elements import RelativePose
 from ..experiments.tables import number, table
 from . import colmap_batches as batches
-from .colmap_batches import Matched, Photo
-from .colmap_cameras import MODELS, PhotoCamera, photo_points
-from .colmap_database import Database, Geometry, images_of, opened
+from .colmap_batches import Block
+from .colmap_cameras import MODELS, PhotoCamera, PhotoPoints, photo_points
+from .colmap_database import Database, Geometry, Matches, images_of, opened
 from .colmap_orientation import Found, Kind
 from .console import consoles, progress
 from .tables import TableError
@@ -95,27 +94,56 @@ def orient_database(options: Options, told: Callable[..., None] = lambda done, t
         raise TableError("--sigma", None, None, repr(options.sigma), "a positive number of pixels")
     begin, summary = time.perf_counter(), Summary()
     with opened(options.database, options.out, options.force) as database:
-        numbers, lengths = map(list, zip(*database.pair_ids(), strict=True)) if database.pair_ids() else ([], [])
-        cameras, photos = _photos(database, numbers, options.assume_calibrated)
-        summary.unseen = sum(int(np.sum(~photo.points.seen)) for photo in photos.values())
-        read = lambda places: _matched(database, photos, [numbers[i] for i in places])
+        matched = database.pair_ids()
+        numbers, lengths = [number for number, _ in matched], [length for _, length in matched]
+        photos = _photos(database, numbers, options.assume_calibrated)
+        summary.unseen = int(np.sum(~photos.points.seen))
+        of_block: list[Matches] = []
+
+        def read(places: list[int]) -> Block:
+            of_block[:] = _matches(database, photos, [numbers[i] for i in places])
+            return photos.block([numbers[i] for i in places], of_block)
+
         count = lambda done: told(done, len(numbers))
-        for places, pairs, found in batches.oriented(lengths, read, options.sigma, count):
-            geometries = []
-            for row, (place, pair) in enumerate(zip(places, pairs, strict=True)):
-                a, b = images_of(numbers[place])
-                kind = Kind(int(found.kind[row]))
-                geometries.append(geometry(numbers[place], pair, found, row, cameras[a].matrix, cameras[b].matrix))
-                summary.add(geometries[-1], kind, len(pair.matches), float(found.sigma0[row]))
-            database.write(geometries)
+        for places, found in batches.oriented(lengths, read, photos.points, options.sigma, count):
+            pair_ids = [numbers[i] for i in places]
+            matrices = [np.stack([photos.cameras[image].matrix for image in side]) for side in _sides(pair_ids)]
+            new = geometries(pair_ids, of_block, found, *matrices)
+            database.write(new)
+            for one, matches, kind, sigma0 in zip(new, of_block, found.kind, found.sigma0, strict=True):
+                summary.add(one, Kind(int(kind)), len(matches), float(sigma0))
     summary.seconds = time.perf_counter() - begin
     return summary
 
 
-def _photos(
-    database: Database, numbers: list[int], assume_calibrated: bool
-) -> tuple[dict[int, PhotoCamera], dict[int, Photo]]:
-    """Camera and keypoints of every image that is matched."""
+@dataclass(frozen=True)
+class Photos:
+    """The images that are matched: their cameras, all their keypoints, and where those of an image begin and end."""
+
+    cameras: dict[int, PhotoCamera]
+    points: PhotoPoints
+    begin: dict[int, int]
+    end: dict[int, int]
+
+    def block(self, pair_ids: list[int], matches: list[Matches]) -> Block:
+        """The pairs with places in all keypoints."""
+        every = np.concatenate([*matches, np.zeros((0, 2), np.int64)])
+        lengths = np.array([len(m) for m in matches])
+        columns, focals = [], []
+        for k, side in enumerate(_sides(pair_ids)):
+            columns.append(every[:, k] + np.repeat([self.begin[image] for image in side], lengths))
+            focals.append(np.array([self.cameras[image].focal for image in side]))
+        return Block(*columns, lengths, *focals)
+
+
+def _sides(pair_ids: list[int]) -> tuple[list[int], list[int]]:
+    """The first and the second images of the pairs."""
+    both = [images_of(pair_id) for pair_id in pair_ids]
+    return [a for a, _ in both], [b for _, b in both]
+
+
+def _photos(database: Database, numbers: list[int], assume_calibrated: bool) -> Photos:
+    """Cameras and keypoints of every image that is matched."""
     images, cameras = database.images(), database.cameras()
     wanted: dict[int, int] = {}
     for pair_id in numbers:
@@ -142,59 +170,60 @@ def _photos(
             row = f"image_id {image} ({images[image].name})"
             raise database.error("keypoints", row, None, "no such row", "the keypoints of a matched image")
     of_image = {image: cameras[images[image].camera] for image in wanted}
-    points = photo_points([keypoints[image] for image in wanted], list(of_image.values()))
-    photos = {image: Photo(p, of_image[image].focal) for image, p in zip(wanted, points, strict=True)}
-    return of_image, photos
+    lengths = [len(keypoints[image]) for image in wanted]
+    pixels = np.concatenate([*(keypoints[image] for image in wanted), np.zeros((0, 2))])
+    points = photo_points(pixels, list(of_image.values()), lengths)
+    ends = np.cumsum(lengths).tolist()
+    begins = [end - length for end, length in zip(ends, lengths, strict=True)]
+    return Photos(of_image, points, dict(zip(wanted, begins, strict=True)), dict(zip(wanted, ends, strict=True)))
 
 
-def _matched(database: Database, photos: dict[int, Photo], numbers: list[int]) -> Iterator[Matched]:
-    for pair_id, matches in zip(numbers, database.matches(numbers), strict=True):
-        left, right = (photos[image] for image in images_of(pair_id))
-        for column, photo in enumerate((left, right)):
-            most = int(matches[:, column].max(initial=-1))
-            if most >= len(photo.points.x):
-                image = images_of(pair_id)[column]
-                expected = f"places below {len(photo.points.x)}, the number of keypoints of image {image}"
+def _matches(database: Database, photos: Photos, pair_ids: list[int]) -> list[Matches]:
+    """The matches of these pairs. Raises TableError if one names a keypoint that does not exist."""
+    found = list(database.matches(pair_ids))
+    for pair_id, matches in zip(pair_ids, found, strict=True):
+        for image, most in zip(images_of(pair_id), matches.max(axis=0, initial=-1), strict=True):
+            count = photos.end[image] - photos.begin[image]
+            if most >= count:
+                expected = f"places below {count}, the number of keypoints of image {image}"
                 raise database.error("matches", f"pair_id {pair_id}", "data", f"keypoint {most}", expected)
-        yield Matched(left, right, matches)
+    return found
 
 
-def geometry(pair_id: int, pair: Matched, found: Found, row: int, k1: np.ndarray, k2: np.ndarray) -> Geometry:
-    """The row of two_view_geometries of the pair at `row` of a batch."""
-    kind = Kind(int(found.kind[row]))
-    kept = pair.matches[np.asarray(found.kept[row, : len(pair.matches)])]
-    if kind in (Kind.no_consensus, Kind.too_few):
-        return Geometry(pair_id, kept[:0], CONFIG[kind])
-    q, turn, base = _relative(found.pose, row)
+def geometries(
+    pair_ids: list[int],
+    matches: list[Matches],
+    found: Found,
+    k1: Float[np.ndarray, "pair 3 3"],
+    k2: Float[np.ndarray, "pair 3 3"],
+) -> list[Geometry]:
+    """The rows of two_view_geometries of a block of pairs; k1, k2: the matrices of their cameras."""
+    signs = np.diagonal(D)
+    # a half turn about x (D) of the inverse: of the quaternion only x changes its sign
+    q = np.asarray(found.quaternion) * np.array([1.0, -1.0, 1.0, 1.0])
+    turn = D @ np.swapaxes(found.rotation, 1, 2) @ D
+    t = -np.einsum("pij,pj->pi", turn, signs * found.base)
+    essential = np.stack([np.cross(t, turn[:, :, k]) for k in range(3)], axis=-1)
     back, forth = np.linalg.inv(k1), np.linalg.inv(k2)
-    t = -turn @ base
-    homography = k2 @ turn @ (np.eye(3) - np.outer(base, D @ [float(c[row]) for c in found.normal])) @ back
-    essential = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ turn
-    fundamental = forth.T @ essential @ back
-    if kind == Kind.rotation:
-        return Geometry(pair_id, kept, CONFIG[kind], H=k2 @ turn @ back, qvec=q, tvec=np.zeros(3))
-    if kind == Kind.plane:
-        return Geometry(pair_id, kept, CONFIG[kind], fundamental, essential, homography)
-    if kind == Kind.weak:
-        return Geometry(pair_id, kept, CONFIG[kind], fundamental, essential)
-    return Geometry(pair_id, kept, CONFIG[kind], fundamental, essential, qvec=q, tvec=t)
-
-
-def _relative(
-    pose: RelativePose, row: int
-) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Quaternion (w, x, y, z) and matrix of R' = D Rᵀ D, and D b."""
-    w, x, y, z, *base = (float(getattr(pose, name)[row]) for name in ("qw", "qx", "qy", "qz", "bx", "by", "bz"))
-    # D turns by half a turn about x: the vector part of the inverse, turned
-    x, y, z = -x, y, z
-    matrix = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return np.array([w, x, y, z]), matrix, D @ np.array(base)
+    fundamental = np.swapaxes(forth, 1, 2) @ essential @ back
+    normal = signs * found.normal
+    rotation = k2 @ turn @ back
+    homography = rotation + k2 @ (t[:, :, None] * normal[:, None, :]) @ back
+    out = []
+    for i, (pair_id, all_matches) in enumerate(zip(pair_ids, matches, strict=True)):
+        kind = Kind(int(found.kind[i]))
+        row = (pair_id, all_matches[found.kept[i, : len(all_matches)]], CONFIG[kind])
+        if kind in (Kind.no_consensus, Kind.too_few):
+            out.append(Geometry(*row))
+        elif kind == Kind.rotation:
+            out.append(Geometry(*row, H=rotation[i], qvec=q[i], tvec=np.zeros(3)))
+        elif kind == Kind.plane:
+            out.append(Geometry(*row, fundamental[i], essential[i], homography[i]))
+        elif kind == Kind.weak:
+            out.append(Geometry(*row, fundamental[i], essential[i]))
+        else:
+            out.append(Geometry(*row, fundamental[i], essential[i], qvec=q[i], tvec=t[i]))
+    return out
 
 
 def _show(console: Console, options: Options, summary: Summary) -> None:
@@ -218,4 +247,6 @@ def _show(console: Console, options: Options, summary: Summary) -> None:
         if not 0.5 <= ratio <= 2:
             console.print(f"Mind: keypoints seem to have about this sigma: try --sigma {ratio * options.sigma:.2g}")
     each = 1e3 * summary.seconds / max(pairs, 1)
-    console.print(f"{summary.seconds:.1f} s, {each:.2f} ms a pair. Written to {options.out or options.database}", markup=False)
+    console.print(
+        f"{summary.seconds:.1f} s, {each:.2f} ms a pair. Written to {options.out or options.database}", markup=False
+    )

@@ -91,7 +91,7 @@ class PhotoCamera(NamedTuple):
 
 
 class PhotoPoints(NamedTuple):
-    """Keypoints of one image: x, y as above; `scale`, how much larger an error is in them than it was in the image;
+    """Keypoints: x, y as above; `scale`, how much larger an error is in them than it was in the image;
     `seen`, false where no ray is seen at the keypoint (their coordinates are zero)."""
 
     x: Float[np.ndarray, "point"]
@@ -137,31 +137,26 @@ def _all(measured: tuple) -> tuple:
     return jax.vmap(undistorted)(*measured)
 
 
-def photo_points(keypoints: list[Float[np.ndarray, "point 2"]], cameras: list[PhotoCamera]) -> list[PhotoPoints]:
-    """The keypoints of every image as seen by its camera, all of them in few calls."""
-    lengths = [len(points) for points in keypoints]
-    of_image = np.array(
-        [[*c.focals, c.focal, *(c.parameters.get(name, 0.0) for name in ("cx", "cy", *COEFFICIENTS))] for c in cameras]
-    ).reshape(-1, 5 + len(COEFFICIENTS))
-    pixels = np.concatenate([*keypoints, np.zeros((0, 2))])
+def photo_points(pixels: Float[np.ndarray, "point 2"], cameras: list[PhotoCamera], lengths: list[int]) -> PhotoPoints:
+    """The keypoints of all images, one image after another, `lengths` of them by each of the cameras."""
+    names = ("cx", "cy", *COEFFICIENTS)
+    rows = [[*c.focals, c.focal, *(c.parameters.get(name, 0.0) for name in names)] for c in cameras]
+    of_image = np.array(rows).reshape(-1, 3 + len(names))
     owner = np.repeat(np.arange(len(lengths)), lengths)
+    plain = not np.any(of_image[:, 5:])
     found = np.zeros((4, len(pixels)))
     run = Program(_all, {})
     for begin in range(0, len(pixels), TOGETHER):
         part = slice(begin, begin + TOGETHER)
-        fx, fy, f, cx, cy, *coefficients = of_image[owner[part]].T
-        wanted = ((pixels[part, 0] - cx) / fx, (pixels[part, 1] - cy) / fy)
-        if not any(np.any(c) for c in coefficients):
-            u, v = wanted
-            det, exists = np.ones_like(u), np.isfinite(u + v)
-        else:
-            u, v, det, exists = _padded(run, wanted, coefficients)
+        fx, fy, f, cx, cy = of_image[:, :5].T[:, owner[part]]
+        u, v = (pixels[part, 0] - cx) / fx, (pixels[part, 1] - cy) / fy
+        det, exists = np.ones_like(u), np.ones(u.shape, bool)
+        if not plain:
+            u, v, det, exists = _padded(run, (u, v), list(of_image[:, 5:].T[:, owner[part]]))
         exists = exists & np.isfinite(u + v)
         det = np.where(exists, det, 1.0)
         found[:, part] = np.where(exists, (f * u, -f * v, f / np.sqrt(fx * fy * det), exists), 0.0)
-    ends = np.cumsum(lengths)[:-1]
-    x, y, scale, seen = (np.split(row, ends) for row in found)
-    return [PhotoPoints(*one[:3], one[3] > 0) for one in zip(x, y, scale, seen, strict=True)]
+    return PhotoPoints(*found[:3], found[3] > 0)
 
 
 def _padded(run: Program, wanted: tuple, coefficients: list) -> tuple:

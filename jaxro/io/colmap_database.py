@@ -21,6 +21,8 @@ from .files import check_file
 from .tables import TableError
 
 MOST_IMAGES = 2147483647
+WAIT = 1.0
+"""Seconds to wait for a database that something else writes to."""
 NEEDED = {
     "cameras": ("camera_id", "model", "params", "prior_focal_length"),
     "images": ("image_id", "name", "camera_id"),
@@ -30,7 +32,7 @@ NEEDED = {
 }
 """Tables and columns without which nothing can be done."""
 
-Matches = Int[np.ndarray, "match 2"]
+Matches = Int[np.ndarray, "_ 2"]
 
 
 class Image(NamedTuple):
@@ -102,7 +104,7 @@ class Database:
         """Images by number."""
         return {number: Image(*rest) for number, *rest in self._rows("images", NEEDED["images"], "1")}
 
-    def keypoints(self, wanted: set[int]) -> dict[int, Float[np.ndarray, "point 2"]]:
+    def keypoints(self, wanted: set[int]) -> dict[int, Float[np.ndarray, "_ 2"]]:
         """Pixel coordinates of the keypoints of the images wanted."""
         found = {}
         for number, rows, cols, data in self._rows("keypoints", NEEDED["keypoints"], "1"):
@@ -184,8 +186,7 @@ def opened(file: Path, out: Path | None, force: bool) -> Iterator[Database]:
     try:
         with _said(file):
             draft.parent.mkdir(parents=True, exist_ok=True)
-            address = f"{file.absolute().as_uri()}?mode=ro"
-            with closing(sqlite3.connect(address, uri=True)) as source, closing(sqlite3.connect(draft)) as target:
+            with closing(sqlite3.connect(file)) as source, closing(sqlite3.connect(draft)) as target:
                 source.backup(target)
         with _transaction(draft, file) as database:
             _refuse(database, force)
@@ -199,7 +200,7 @@ def opened(file: Path, out: Path | None, force: bool) -> Iterator[Database]:
 
 @contextmanager
 def _transaction(path: Path, name: Path) -> Iterator[Database]:
-    with _said(name), closing(sqlite3.connect(path, isolation_level=None)) as connection:
+    with _said(name), closing(sqlite3.connect(path, timeout=WAIT, isolation_level=None)) as connection:
         connection.execute("BEGIN IMMEDIATE")
         try:
             yield Database(name, connection)

@@ -1,11 +1,13 @@
 """The orientation of image pairs from automatic matches, a good part of them wrong, photos in any position.
 
-1. A search by random subsets on at most SEARCHED matches, evenly taken: of eight points, solved linearly; where these
-   do not suffice or fit a plane, of five. It suffices when a better pose would have been met with the probability of
-   its `confidence`: many good points agree with wrong poses, too, so that their number alone does not prove a pose.
+1. A search by random subsets on at most SEARCHED matches, evenly taken: of eight points, solved linearly.
 2. All matches are judged anew by |w| at the familywise LEVEL, in turns with least squares. A match whose rays meet
    behind a photo is wrong, unless they are parallel within their errors.
-3. The set that is left is believed if sets as good are not expected by accident (Moisan and Stival 2004):
+3. Where the subsets tried do not suffice for the share of matches that is kept, or the pair is not oriented by them
+   (eight points of a plane determine nothing), the same with subsets of five points. They suffice when a better pose
+   would have been met with the probability `confidence`: many good points agree with wrong poses, too, so that their
+   number alone does not prove a pose.
+4. The set that is left is believed if sets as good are not expected by accident (Moisan and Stival 2004):
 
        C(n, k) C(k, 5) p^(k-5) (n - 5) < ACCIDENTS,
 
@@ -13,17 +15,18 @@
 """
 
 import enum
+import math
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.special import gammaln
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .. import coplanarity, critical_values, rotations as rot
-from ..conditions import linearised
 from ..elements import RelativePose
 from ..normal_equations import accumulate, solve
 from ..orientation import orient
@@ -35,13 +38,14 @@ from ..rejection.robust import agreeing, in_front
 from ..results import RESULTS, is_usable
 
 SEARCHED = 256
-EIGHT = Ransac(EightPoint(), count=128, confidence=0.99, limit=5.0)
+EIGHT = Ransac(EightPoint(), count=128, confidence=0.9, limit=5.0)
 FIVE = Ransac(FivePoint(), count=1024, confidence=0.99, limit=5.0)
 """Enough down to a third of right matches."""
 
 LEVEL = 0.01
 """Probability that a pair without wrong matches loses one."""
 
+SLACK = 0.05
 ROUNDS = 10
 SHIFTS = 8
 """Other partners that each point is given."""
@@ -63,34 +67,40 @@ class Kind(enum.IntEnum):
 
 
 class Found(eqx.Module):
-    """Matches kept, the pose by them, n of the plane n · λ p1 = 1 nearest to them, and what that is worth."""
+    """Matches kept, the pose by them (w, x, y, z; R; unit base), n of the plane n · λ p1 / f1 = 1 nearest to them, and
+    what that is worth: sigma0 and the number of a `Kind`."""
 
     kept: Bool[Array, "*pairs match"]
-    pose: RelativePose
-    normal: tuple[Float[Array, "*pairs"], Float[Array, "*pairs"], Float[Array, "*pairs"]]
+    quaternion: Float[Array, "*pairs 4"]
+    rotation: Float[Array, "*pairs 3 3"]
+    base: Float[Array, "*pairs 3"]
+    normal: Float[Array, "*pairs 3"]
     sigma0: Float[Array, "*pairs"]
-    kind: Array
+    kind: Int[Array, "*pairs"]
 
 
 class Plane(NamedTuple):
     """n, and the share of the points that lie in the plane."""
 
-    normal: rot.Vector
+    normal: Float[Array, "3"]
     share: Float[Array, ""]
 
 
-def searched(pair: Pair, search: Ransac) -> tuple[RelativePose, Bool[Array, ""]]:
-    """The pose of most matches, and whether the search sufficed."""
-    pair = cleaned(pair)[0]
-    found = search.found(pair)
-    enough = (found.blocks * search.hypotheses.block).astype(found.enough.dtype) >= found.enough
-    if isinstance(search.hypotheses, EightPoint):  # which does not see the pose in a plane
-        use = pair.mask & (squares(pair, found.pose) <= search.limit**2)
-        enough = enough & (plane(pair, found.pose, use, search.limit).share < PLANE)
-    return found.pose, enough
+def searched(pair: Pair, search: Ransac) -> tuple[RelativePose, Int[Array, ""]]:
+    """The pose of most matches, and the number of subsets tried."""
+    found = search.found(cleaned(pair)[0])
+    return found.pose, found.blocks * search.hypotheses.block
 
 
-def judged(pair: Pair, pose: RelativePose, enough: Bool[Array, ""]) -> Found:
+def suffices(
+    search: Ransac, tried: Int[np.ndarray, "pair"], kept: Int[np.ndarray, "pair"], of: Int[np.ndarray, "pair"]
+):
+    """Whether so many subsets are enough for the share of matches kept, the search having kept up to SLACK more."""
+    share = np.clip(kept / np.maximum(of, 1) + SLACK, 1e-3, 1 - 1e-9)
+    return tried * np.log1p(-(share**search.hypotheses.size)) <= math.log1p(-search.confidence)
+
+
+def judged(pair: Pair, pose: RelativePose) -> Found:
     """All matches of a pair judged by the pose of a search."""
     pair = cleaned(pair)[0]
     each = lambda n: critical_values.normal(LEVEL / jnp.maximum(n, 1.0))
@@ -103,7 +113,7 @@ def judged(pair: Pair, pose: RelativePose, enough: Bool[Array, ""]) -> Found:
     kind = jnp.where(share < PLANE, int(Kind.oriented), int(Kind.plane))
     # what lies behind a photo here is infinitely far for its errors
     fair = is_usable(result) | (result == RESULTS.points_behind_camera)
-    believed = enough & (accidents(pair, pose, use, limit) < jnp.log(ACCIDENTS))
+    believed = accidents(pair, pose, use, limit) < math.log(ACCIDENTS)
     for holds, other in (
         (~fair | ~believed, Kind.no_consensus),
         (believed & (result == RESULTS.weakly_determined), Kind.weak),
@@ -111,7 +121,9 @@ def judged(pair: Pair, pose: RelativePose, enough: Bool[Array, ""]) -> Found:
         (count(pair.mask) < 6, Kind.too_few),
     ):
         kind = jnp.where(holds, int(other), kind)
-    return Found(use & (kind < Kind.no_consensus), pose, normal, solved.sigma0, kind)
+    rotation = rot.as_array(pose.relative()[0])
+    kept = use & (kind < int(Kind.no_consensus))
+    return Found(kept, pose.quaternion, rotation, pose.base, normal, solved.sigma0, kind)
 
 
 def parallel(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> Bool[Array, "match"]:
@@ -141,7 +153,8 @@ def plane(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> P
     def squared(point, sigma, normal):
         x1, y1, x2, y2 = point
         p = (x1 / pair.focal_left, y1 / pair.focal_left, -jnp.ones_like(x1))
-        x, y, z = rot.apply(back, tuple(c - b * rot.dot(normal, p) for c, b in zip(p, base, strict=True)))
+        nearness = rot.dot(normal, p)
+        x, y, z = rot.apply(back, (p[0] - base[0] * nearness, p[1] - base[1] * nearness, p[2] - base[2] * nearness))
         safe = jnp.where(z < 0, z, -1.0)
         off = (pair.focal_right * x / -safe - x2) ** 2 + (pair.focal_right * y / -safe - y2) ** 2
         return jnp.where(z < 0, off / (2 * sigma**2), jnp.inf)
@@ -158,9 +171,8 @@ def plane(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> P
     zero = jnp.zeros_like(pair.focal_left)
     n, h, _ = accumulate([target], [[c] for c in columns], [jnp.where(use, 1.0, 0.0)])
     normal = lax.fori_loop(0, 2, turn, tuple(solve(n, h)))
-    normal = tuple(jnp.where(jnp.isfinite(c), c, zero) for c in normal)
     within = use & (errors(pair.coordinates, pair.sigma, normal) <= limit**2)
-    return Plane(normal, count(within) / jnp.maximum(count(use), 1.0))
+    return Plane(jnp.stack([jnp.where(jnp.isfinite(c), c, zero) for c in normal]), count(within) / jnp.maximum(count(use), 1.0))
 
 
 def accidents(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> Float[Array, ""]:
@@ -174,7 +186,9 @@ def accidents(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) 
         step = 1 + i * jnp.maximum(number // SHIFTS, 1)
         partner = (index + step) % jnp.maximum(number, 1)
         others = rows.at[partner].get(mode="clip")
-        mixed = Pair(rows[:, 0], rows[:, 1], others[:, 2], others[:, 3], pair.sigma, there, pair.focal_left, pair.focal_right)
+        mixed = Pair(
+            rows[:, 0], rows[:, 1], others[:, 2], others[:, 3], pair.sigma, there, pair.focal_left, pair.focal_right
+        )
         return agree + count(there & (squares(mixed, pose) <= limit**2))
 
     p = (lax.fori_loop(0, SHIFTS, shifted, n * 0) + 1) / (SHIFTS * n + 2)
