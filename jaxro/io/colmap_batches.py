@@ -80,7 +80,7 @@ def _found(block: Block, points: PhotoPoints, size: int, sigma: float, told: Cal
 
 def _by(search: Ransac, few: Fields, every: Fields, told: Callable[[int], None]) -> tuple[Found, np.ndarray]:
     """What was found by this search, and where it sufficed."""
-    pose, tried = _each(_all_searched, few, max(1, IN_CACHE // 16 // few[0].shape[1]), told, search=search)
+    pose, tried = _each(_all_searched, few, max(1, IN_CACHE // 8 // few[0].shape[1]), told, search=search)
     found = _each(_all_judged, (every, pose), max(1, IN_CACHE // every[0].shape[1]), lambda count: None)
     return found, suffices(search, tried, np.sum(found.kept, axis=1), np.sum(every[5], axis=1))
 

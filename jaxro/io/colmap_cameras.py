@@ -141,22 +141,30 @@ def photo_points(pixels: Float[np.ndarray, "point 2"], cameras: list[PhotoCamera
     """The keypoints of all images, one image after another, `lengths` of them by each of the cameras."""
     names = ("cx", "cy", *COEFFICIENTS)
     rows = [[*c.focals, c.focal, *(c.parameters.get(name, 0.0) for name in names)] for c in cameras]
-    of_image = np.array(rows).reshape(-1, 3 + len(names))
-    owner = np.repeat(np.arange(len(lengths)), lengths)
-    plain = not np.any(of_image[:, 5:])
-    found = np.zeros((4, len(pixels)))
+    of_image = np.array(rows).reshape(-1, 3 + len(names)).T
+    spread = lambda values: np.repeat(values, lengths)  # to the keypoints of every image
+    fx, fy, f, cx, cy = map(spread, of_image[:5])
+    u, v = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
+    scale = f / np.sqrt(fx * fy)
+    seen = np.isfinite(u + v)
+    if np.any(of_image[5:]):
+        u, v, det, exists = _in_parts(u, v, list(map(spread, of_image[5:])))
+        seen = seen & exists & np.isfinite(u + v)
+        scale = scale / np.sqrt(np.where(seen, det, 1.0))
+    if np.all(seen):
+        return PhotoPoints(f * u, -f * v, scale, seen)
+    return PhotoPoints(*(np.where(seen, a, 0.0) for a in (f * u, -f * v, scale)), seen)
+
+
+def _in_parts(u: np.ndarray, v: np.ndarray, coefficients: list[np.ndarray]) -> list[np.ndarray]:
+    """`undistorted` of all keypoints, TOGETHER at a time, so that few programs are compiled."""
     run = Program(_all, {})
-    for begin in range(0, len(pixels), TOGETHER):
+    found = []
+    for begin in range(0, len(u), TOGETHER):
         part = slice(begin, begin + TOGETHER)
-        fx, fy, f, cx, cy = of_image[:, :5].T[:, owner[part]]
-        u, v = (pixels[part, 0] - cx) / fx, (pixels[part, 1] - cy) / fy
-        det, exists = np.ones_like(u), np.ones(u.shape, bool)
-        if not plain:
-            u, v, det, exists = _padded(run, (u, v), list(of_image[:, 5:].T[:, owner[part]]))
-        exists = exists & np.isfinite(u + v)
-        det = np.where(exists, det, 1.0)
-        found[:, part] = np.where(exists, (f * u, -f * v, f / np.sqrt(fx * fy * det), exists), 0.0)
-    return PhotoPoints(*found[:3], found[3] > 0)
+        found.append(_padded(run, (u[part], v[part]), [c[part] for c in coefficients]))
+    empty = np.zeros(0), np.zeros(0), np.ones(0), np.zeros(0, bool)
+    return [np.concatenate(columns) for columns in zip(empty, *found, strict=True)]
 
 
 def _padded(run: Program, wanted: tuple, coefficients: list) -> tuple:

@@ -32,21 +32,24 @@ from ..normal_equations import accumulate, solve
 from ..orientation import orient
 from ..pairs import Pair, cleaned
 from ..reductions import count
-from ..rejection.hypotheses import EightPoint, FivePoint, moved_up, squares
+from ..rejection.hypotheses import EightPoint, FivePoint, moved_up, squares, vectors
 from ..rejection.ransac import Ransac
-from ..rejection.robust import agreeing, in_front
+from ..rejection.robust import agreeing, improved, in_front
 from ..results import RESULTS, is_usable
+from ..starts.general import _rotation_only as rotation_only
 
 SEARCHED = 256
-EIGHT = Ransac(EightPoint(), count=128, confidence=0.9, limit=5.0)
+EIGHT = Ransac(EightPoint(block=8), count=128, confidence=0.9, limit=5.0)
 FIVE = Ransac(FivePoint(), count=1024, confidence=0.99, limit=5.0)
 """Enough down to a third of right matches."""
 
 LEVEL = 0.01
 """Probability that a pair without wrong matches loses one."""
 
-SLACK = 0.05
+SLACK = 0.1
 ROUNDS = 10
+STEPS = 6
+WIDE = 3.0
 SHIFTS = 8
 """Other partners that each point is given."""
 
@@ -80,9 +83,10 @@ class Found(eqx.Module):
 
 
 class Plane(NamedTuple):
-    """n, and the share of the points that lie in the plane."""
+    """n, the points that lie in the plane, and the share they are."""
 
     normal: Float[Array, "3"]
+    within: Bool[Array, "match"]
     share: Float[Array, ""]
 
 
@@ -105,19 +109,30 @@ def judged(pair: Pair, pose: RelativePose) -> Found:
     pair = cleaned(pair)[0]
     each = lambda n: critical_values.normal(LEVEL / jnp.maximum(n, 1.0))
     limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
-    pose, use = agreeing(pair, pose, pair.mask & (squares(pair, pose) <= 2 * limit**2), limit, ROUNDS)
+    within = lambda pose, factor: pair.mask & (squares(pair, pose) <= (factor * limit) ** 2)
+    # a subset's pose is the worse the weaker the layout: it moves on points from further away before it judges them
+    nearer = lambda k, pose: improved(pair, pose, within(pose, WIDE - k * (WIDE - 1) / STEPS))
+    pose = lax.fori_loop(0, STEPS, nearer, pose)
+    pose = visible(pair, pose, within(pose, 1.0), limit)
+    pose, use = agreeing(pair, pose, within(pose, 1.0), limit, ROUNDS)
     use = use & (in_front(pair, pose) | parallel(pair, pose, limit))
     solved = orient(pair.with_mask(use), start=pose)
     pose, result = solved.pose, solved.result
-    normal, share = plane(pair, pose, use, limit)
+    normal, _, share = plane(pair, pose, use, limit)
     kind = jnp.where(share < PLANE, int(Kind.oriented), int(Kind.plane))
     # what lies behind a photo here is infinitely far for its errors
     fair = is_usable(result) | (result == RESULTS.points_behind_camera)
+    # a large sigma0 hides a base, too: the rays themselves have to be parallel, by the rotation alone
+    rotated, _ = rotation_only(*vectors(pair), use)
+    still = parallel(pair, rotated, limit)
+    turned = (result == RESULTS.zero_base) & (count(use & still) >= PLANE * count(use))
+    pose = jax.tree.map(lambda a, b: jnp.where(turned, a, b), rotated, pose)
+    use = jnp.where(turned, still, use)
     believed = accidents(pair, pose, use, limit) < math.log(ACCIDENTS)
     for holds, other in (
         (~fair | ~believed, Kind.no_consensus),
         (believed & (result == RESULTS.weakly_determined), Kind.weak),
-        (believed & (result == RESULTS.zero_base), Kind.rotation),
+        (believed & turned, Kind.rotation),
         (count(pair.mask) < 6, Kind.too_few),
     ):
         kind = jnp.where(holds, int(other), kind)
@@ -139,16 +154,19 @@ def parallel(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> Bool[Ar
 
 
 def plane(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> Plane:
-    """The plane nearest to the points in use: n of 1/λ = n · p1, linear, in three turns in which points off it lose
-    their weight. A point lies in it if the homography p2 ~ Rᵀ (p1 - b (n · p1)) takes p1 to p2 within the limit."""
+    """The plane nearest to the points in use: n of c x p1 = (c x b) (n · p1), c = R p2, linear, in three turns in which
+    points off it lose their weight. A point lies in it if the homography p2 ~ Rᵀ (p1 - b (n · p1)) takes p1 to p2
+    within the limit."""
     rotation, base = pose.relative()
     back = rot.transpose(rotation)
 
     def inverse_depth(point):
-        first, _, w2, lam, _ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
-        depth = lam * pair.focal_left
-        far = jnp.abs(depth) * 1e3 > w2  # not nearer than a thousandth of the base
-        return *(c / pair.focal_left for c in first), jnp.where(far, w2 / jnp.where(far, depth, 1.0), 0.0)
+        x1, y1, x2, y2 = point
+        p = (x1 / pair.focal_left, y1 / pair.focal_left, -jnp.ones_like(x1))
+        c = rot.apply(rotation, (x2 / pair.focal_right, y2 / pair.focal_right, -jnp.ones_like(x2)))
+        across = rot.cross(c, base)
+        squared = rot.dot(across, across)
+        return *p, rot.dot(across, rot.cross(c, p)) / jnp.where(squared > 0, squared, 1.0), squared
 
     def squared(point, sigma, normal):
         x1, y1, x2, y2 = point
@@ -159,20 +177,50 @@ def plane(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> P
         off = (pair.focal_right * x / -safe - x2) ** 2 + (pair.focal_right * y / -safe - y2) ** 2
         return jnp.where(z < 0, off / (2 * sigma**2), jnp.inf)
 
-    *columns, target = jax.vmap(inverse_depth)(pair.coordinates)
+    *columns, target, sure = jax.vmap(inverse_depth)(pair.coordinates)
     errors = jax.vmap(squared, in_axes=(0, 0, None))
 
     def turn(_, normal):
         s = errors(pair.coordinates, pair.sigma, normal) / limit**2
-        weight = jnp.where(use, 1 / (1 + jnp.minimum(s, 1e6)), 0.0)
+        weight = jnp.where(use, sure / (1 + jnp.minimum(s, 1e6)), 0.0)
         n, h, _ = accumulate([target], [[c] for c in columns], [weight])
         return tuple(solve(n, h))
 
     zero = jnp.zeros_like(pair.focal_left)
-    n, h, _ = accumulate([target], [[c] for c in columns], [jnp.where(use, 1.0, 0.0)])
+    n, h, _ = accumulate([target], [[c] for c in columns], [jnp.where(use, sure, 0.0)])
     normal = lax.fori_loop(0, 2, turn, tuple(solve(n, h)))
     within = use & (errors(pair.coordinates, pair.sigma, normal) <= limit**2)
-    return Plane(jnp.stack([jnp.where(jnp.isfinite(c), c, zero) for c in normal]), count(within) / jnp.maximum(count(use), 1.0))
+    finite = jnp.stack([jnp.where(jnp.isfinite(c), c, zero) for c in normal])
+    return Plane(finite, within, count(within) / jnp.maximum(count(use), 1.0))
+
+
+def visible(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> RelativePose:
+    """Of a plane scene the pose that has more points in front of both photos; of other scenes the pose as it is.
+
+    A homography Rᵀ A, A = I - b nᵀ, belongs to two poses (Longuet-Higgins 1986), because AᵀA = I + n wᵀ + w nᵀ, w =
+    n/2 - b, is the same for n and w exchanged: n' = w, b' = β w / 2 - n, R' = (A A'⁻¹)ᵀ R with det A' = det A.
+    """
+    normal, use, share = plane(pair, pose, use, limit)
+    rotation, base = pose.relative()
+    n, b = (normal[0], normal[1], normal[2]), base
+    w = (n[0] / 2 - b[0], n[1] / 2 - b[1], n[2] / 2 - b[2])
+    det = 1 - rot.dot(b, n)
+    there = (det > 1e-6) & (rot.dot(w, w) > 1e-12) & (share >= PLANE)
+    det, square = jnp.where(there, det, 1.0), jnp.where(there, rot.dot(w, w), 1.0)
+    beta = 2 * (1 + rot.dot(n, w) - det) / square
+    other = (beta / 2 * w[0] - n[0], beta / 2 * w[1] - n[1], beta / 2 * w[2] - n[2])
+    eye = rot.identity(det)
+    first = tuple(tuple(e - b[i] * n[j] for j, e in enumerate(row)) for i, row in enumerate(eye))
+    second = tuple(tuple(e + other[i] * w[j] / det for j, e in enumerate(row)) for i, row in enumerate(eye))
+    turned = rot.product(rot.transpose(rot.product(first, second)), rotation)  # pyright: ignore[reportArgumentType]
+    length = jnp.sqrt(rot.dot(other, other))
+    there = there & (length > 1e-6)
+    unit = (c / jnp.where(there, length, 1.0) for c in other)
+    twin = RelativePose(*rot.to_quaternion(turned), *unit).normalised()
+    fine = there & jnp.isfinite(sum(jax.tree.leaves(twin)))
+    twin = jax.tree.map(lambda a, b: jnp.where(fine, a, b), twin, pose)
+    better = count(use & in_front(pair, twin)) > count(use & in_front(pair, pose))
+    return jax.tree.map(lambda a, b: jnp.where(better, a, b), improved(pair, twin, use), pose)
 
 
 def accidents(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> Float[Array, ""]:
