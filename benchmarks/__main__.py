@@ -12,16 +12,16 @@ from . import metrics as contract
 
 def machine() -> str:
     """One line about where the figures come from."""
-    names = ("jax", "optimistix", "poselib", "numpy")
+    names = ("jax", "optimistix", "poselib", "pycolmap", "numpy")
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
     return f"{datetime.date.today()}, {os.cpu_count()} cores ({platform.machine()}), float64, {versions}."
 
 
 def main() -> int:
-    from . import engine, reading, rejection, scale
+    from . import colmap, engine, reading, rejection, scale
     from .common import QUICK, Size
 
-    suites = engine.SUITES | rejection.SUITES | reading.SUITES | scale.SUITES
+    suites = engine.SUITES | rejection.SUITES | reading.SUITES | scale.SUITES | colmap.SUITES
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few pairs, few repeats: does it run, roughly how fast")

@@ -1,4 +1,4 @@
-"""The command line: `jaxro orient`, `clean`, `compare`, `reproduce`, `heights`, `plan`.
+"""The command line: `jaxro orient`, `clean`, `colmap`, `compare`, `reproduce`, `heights`, `plan`.
 
 Exit code 0: every pair has usable elements; 1: at least one has not; 2: the input could not be used.
 """
@@ -129,6 +129,39 @@ def clean(
         _end(lambda: large.run(options, how, chosen(name, changes)))
     else:
         _end(lambda: run(options, name, changes))
+
+
+@app.command()
+def colmap(
+    database: Annotated[
+        Path,
+        typer.Argument(
+            help="COLMAP database with cameras, keypoints and matches.", metavar="DATABASE.db", show_default=False
+        ),
+    ],
+    sigma: Annotated[
+        float, typer.Option(help="Standard deviation of a keypoint coordinate in pixels.", metavar="SD")
+    ] = 1.0,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="A copy to write to.  [default: the database itself]", metavar="NEW.db", show_default=False),
+    ] = None,
+    assume_calibrated: Annotated[
+        bool,
+        typer.Option("--assume-calibrated", help="Take focal lengths as known that the database marks as guessed."),
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace geometries that are there, and the file of --out.")
+    ] = False,
+) -> None:
+    """Orient every matched pair of a COLMAP database.
+
+    In spite of wrong matches, photos in any position; writes two_view_geometries, all or none.
+    Exit code 0: every pair has a geometry; 1: some pair has none; 2: bad input, nothing written.
+    """
+    from .io.colmap import Options, run
+
+    _end(lambda: run(Options(database, sigma, out, force, assume_calibrated)))
 
 
 @app.command()

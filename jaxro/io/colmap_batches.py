@@ -1,0 +1,138 @@
+"""The matched pairs of a database as padded batches, through search and judgement on all cores."""
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, PyTree
+
+from ..pairs import Pair
+from ..programs import Program
+from ..rejection.ransac import Ransac
+from .buckets import buckets
+from .colmap_cameras import PhotoPoints
+from .colmap_orientation import EIGHT, FIVE, SEARCHED, Found, Kind, judged, searched, suffices
+
+TOGETHER = 2_000_000
+"""Matches in memory at once, padding included: some 300 MB."""
+
+IN_CACHE = 16_384
+"""Matches in one call: what stays in the cache of a core."""
+
+FEW = 64
+"""Matches to which shorter pairs are padded for a search."""
+
+
+Fields = tuple[np.ndarray, ...]
+"""The fields of a `Pair` in NumPy, pairs on the leading axis"""
+
+
+class Block(NamedTuple):
+    """Some pairs: `left` and `right` keypoint of their matches, one pair after another, as places in all keypoints;
+    numbers of matches and focal lengths of the pairs."""
+
+    left: Int[np.ndarray, "match"]
+    right: Int[np.ndarray, "match"]
+    lengths: Int[np.ndarray, "pair"]
+    focal_left: Float[np.ndarray, "pair"]
+    focal_right: Float[np.ndarray, "pair"]
+
+
+def oriented(
+    lengths: list[int],
+    read: Callable[[list[int]], Block],
+    points: PhotoPoints,
+    sigma: float,
+    told: Callable[[int], None],
+) -> Iterator[tuple[list[int], Found]]:
+    """Blocks of pairs, not in order: their places in `lengths` (their numbers of matches), and what was found.
+
+    `read` gives the pairs at these places; `points` are all keypoints; `told` hears how many pairs are done.
+    """
+    done = 0
+    for size, members in buckets(lengths).items() if lengths else ():
+        most = max(1, TOGETHER // size)
+        for begin in range(0, len(members), most):
+            part = members[begin : begin + most]
+            found = _found(read(part), points, size, sigma, lambda count, before=done: told(before + count))
+            done += len(part)
+            told(done)
+            yield part, found
+
+
+def _found(block: Block, points: PhotoPoints, size: int, sigma: float, told: Callable[[int], None]) -> Found:
+    width = SEARCHED if size > FEW else FEW
+    few, every = batch(block, points, width, sigma), batch(block, points, size, sigma)
+    found, sure = _by(EIGHT, few, every, told)
+    rest = np.flatnonzero(~(sure & (found.kind == Kind.oriented)) & (found.kind != Kind.too_few))
+    if rest.size:
+        again, sure_now = _by(FIVE, *(tuple(a[rest] for a in fields) for fields in (few, every)), lambda count: None)
+        take = ~sure[rest] | (np.sum(again.kept, axis=1) >= np.sum(found.kept[rest], axis=1))
+        for old, new in zip(jax.tree.leaves((found, sure)), jax.tree.leaves((again, sure_now)), strict=True):
+            old[rest[take]] = new[take]
+    found.kind[~sure & (found.kind != Kind.too_few)] = Kind.no_consensus
+    found.kept[found.kind >= Kind.no_consensus] = False
+    return found
+
+
+def _by(search: Ransac, few: Fields, every: Fields, told: Callable[[int], None]) -> tuple[Found, np.ndarray]:
+    """What was found by this search, and where it sufficed."""
+    pose, tried = _each(_all_searched, few, max(1, IN_CACHE // 8 // few[0].shape[1]), told, search=search)
+    found = _each(_all_judged, (every, pose), max(1, IN_CACHE // every[0].shape[1]), lambda count: None)
+    return found, suffices(search, tried, np.sum(found.kept, axis=1), np.sum(every[5], axis=1))
+
+
+def _all_searched(fields: tuple, *, search: Ransac) -> tuple:
+    return jax.vmap(lambda pair: searched(pair, search))(Pair(*fields))
+
+
+def _all_judged(found: tuple) -> Found:
+    fields, pose = found
+    return jax.vmap(judged)(Pair(*fields), pose)
+
+
+def batch(block: Block, points: PhotoPoints, size: int, sigma: float) -> Fields:
+    """The fields of the pairs padded to `size`, or `size` of their matches, evenly taken.
+
+    A match with a keypoint that no ray is seen at is masked. The sigma of a match is that of the keypoints times the
+    root mean square of their scales.
+    """
+    n, j = block.lengths[:, None], np.arange(size)[None, :]
+    begin = np.cumsum(block.lengths)[:, None] - n
+    there = j < n
+    place = np.where(there, begin + np.where(n <= size, j, (j * n + n // 2) // size), 0)
+    left, right = (np.append(side, 0)[place] for side in (block.left, block.right))  # there may be none
+    there = there & points.seen[left] & points.seen[right]
+    fill = lambda values, other: np.where(there, values, other)
+    scale = np.sqrt((points.scale[left] ** 2 + points.scale[right] ** 2) / 2)
+    coordinates = [fill(a, 0.0) for a in (points.x[left], points.y[left], points.x[right], points.y[right])]
+    return *coordinates, fill(sigma * scale, 1.0), there, block.focal_left, block.focal_right
+
+
+def _each(function: Callable, data: PyTree, chunk: int, told: Callable[[int], None], **options) -> PyTree:
+    """function(data) in chunks of one size on all cores, as NumPy arrays; the last chunk repeats its last row."""
+    total = len(jax.tree.leaves(data)[0])
+    run = Program(function, options)
+
+    def part(begin: int) -> PyTree:
+        rows = np.minimum(np.arange(begin, begin + chunk), total - 1)
+        return jax.tree.map(np.asarray, run(jax.tree.map(lambda a: a[rows], data)))
+
+    first = part(0)  # alone, so that it is compiled once
+    out = jax.tree.map(lambda a: np.empty((total, *a.shape[1:]), a.dtype), first)
+    done = 0
+
+    def store(begin: int) -> int:
+        end = min(begin + chunk, total)
+        for target, new in zip(jax.tree.leaves(out), jax.tree.leaves(part(begin) if begin else first), strict=True):
+            target[begin:end] = new[: end - begin]
+        return end - begin
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        for count in pool.map(store, range(0, total, chunk)):
+            done += count
+            told(done)
+    return out
