@@ -139,17 +139,12 @@ def colmap(
             help="COLMAP database with cameras, keypoints and matches.", metavar="DATABASE.db", show_default=False
         ),
     ],
-    sigma: Annotated[
-        float, typer.Option(help="Standard deviation of a keypoint coordinate in pixels.", metavar="SD")
-    ] = 1.0,
+    sigma: given.KeypointSigma = 1.0,
     out: Annotated[
         Path | None,
         typer.Option(help="A copy to write to.  [default: the database itself]", metavar="NEW.db", show_default=False),
     ] = None,
-    assume_calibrated: Annotated[
-        bool,
-        typer.Option("--assume-calibrated", help="Take focal lengths as known that the database marks as guessed."),
-    ] = False,
+    assume_calibrated: given.AssumeCalibrated = False,
     force: Annotated[
         bool, typer.Option("--force", help="Replace geometries that are there, and the file of --out.")
     ] = False,

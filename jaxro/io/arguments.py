@@ -126,6 +126,12 @@ Deviation = Annotated[
         show_default=False,
     ),
 ]
+KeypointSigma = Annotated[
+    float, typer.Option(help="Standard deviation of a keypoint coordinate in pixels.", metavar="SD")
+]
+AssumeCalibrated = Annotated[
+    bool, typer.Option("--assume-calibrated", help="Take focal lengths as known that the database marks as guessed.")
+]
 Tables = Annotated[
     str | None,
     typer.Option(
