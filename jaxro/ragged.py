@@ -69,7 +69,7 @@ class Ragged(NamedTuple):
             enough = lambda a: a if end <= len(a) else np.append(a, np.zeros(size, a.dtype))
             windows = lambda a: np.lib.stride_tricks.sliding_window_view(enough(a), size)
             fields = [windows(a)[self.begins[members]] for a in points]
-            fields[-1] = fields[-1] & (np.arange(size)[None, :] < lengths[:, None])
+            fields[-1] = np.logical_and(fields[-1], np.arange(size)[None, :] < lengths[:, None])
         return jax.tree.unflatten(_structure(), [*fields, self.focal_left[members], self.focal_right[members]])
 
     def gather(
