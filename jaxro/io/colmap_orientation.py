@@ -43,12 +43,13 @@ EIGHT = Ransac(EightPoint(block=8), count=128, confidence=0.9, limit=5.0)
 FIVE = Ransac(FivePoint(), count=1024, confidence=0.99, limit=5.0)
 """Enough down to a third of right matches."""
 
-LEVEL = 0.01
-"""Probability that a pair without wrong matches loses one."""
+LEVEL = 0.3
+"""Probability that a pair without wrong matches loses one: there are many, and each wrong one that is kept costs more.
+"""
 
 SLACK = 0.1
 ROUNDS = 10
-STEPS = 6
+STEPS = 3
 WIDE = 3.0
 SHIFTS = 8
 """Other partners that each point is given."""
