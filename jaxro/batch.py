@@ -244,15 +244,17 @@ def _slab_cleaned(pairs: Pair, *, procedure: AbstractProcedure, select: Callable
 def _spread(pairs: Pair, run: Program, way: Way, chunk: int, report: Report) -> PyTree:
     """All slabs through the program, as NumPy arrays."""
     total = pairs.x_left.shape[0]
-    workers = way.threads or len(os.sched_getaffinity(0))
+    small = total * pairs.x_left.shape[1] <= ALONE
+    workers = way.threads or (1 if small else len(os.sched_getaffinity(0)))
     if way.slab is not None:
         size = -(-way.slab // chunk) * chunk
     elif total <= chunk:
         size = 1 << max(total - 1, 0).bit_length()
     else:
         most = max(1, SLAB_POINTS // (chunk * max(pairs.x_left.shape[1], 1)))
-        share = -(-total // (chunk * workers))
-        size = chunk * min(most, 1 << share.bit_length() - 1)  # few sizes: each is another program
+        # four calls a thread, so that none waits long for the last; few sizes: each is another program
+        share = -(-total // chunk) if workers == 1 else max(1, total // (4 * chunk * workers))
+        size = chunk * min(most, 1 << share.bit_length() - 1)
     begins = range(0, total, size)
     part = lambda begin: run(jax.tree.map(lambda a: _filled(a[begin : begin + size], size), pairs))
     shape = (size, pairs.x_left.shape[1], pairs.x_left.dtype)
@@ -288,6 +290,9 @@ def _filled(a: np.ndarray, size: int) -> np.ndarray:
         return a
     return np.concatenate([a, np.zeros((size - a.shape[0], *a.shape[1:]), a.dtype)])
 
+
+ALONE = 1 << 14
+"""Points of a batch that are done before other threads have begun."""
 
 ALIGNMENT = 64
 """Bytes to which JAX wants memory that it takes over without a copy."""
