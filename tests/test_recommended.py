@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import problems
 import pytest
-from workload import FOCAL, aerial
+from workload import FOCAL, aerial, any_position
 
 import jaxro
 from jaxro import simulation
@@ -91,3 +91,26 @@ def test_a_pair_of_mismatches_alone_is_told():
     rng = np.random.default_rng(8)
     pairs = jaxro.pair(*rng.uniform(-70, 70, (4, 2048, 16)), focal=FOCAL)
     assert kept(pairs, NEAR)[1].mean() > 0.9
+
+
+@pytest.mark.slow
+def test_matches_of_other_points_in_any_position():
+    """Three in ten right-hand points exchanged among themselves: such errors reach over the whole photo, lie
+    near their epipolar lines, in front and behind, and give wrong poses that a quarter of the points agree with."""
+    photos, rng = any_position(200, 400, seed=3), np.random.default_rng(0)
+    wrong = rng.random((200, 400)) < 0.3
+    matched = [c.copy() for c in photos]
+    for k, out in enumerate(wrong):
+        other = rng.permutation(400)[: out.sum()]
+        for c, original in zip(matched[2:], photos[2:], strict=True):
+            c[k, out] = original[k, other]
+    right = jaxro.orient_batch(jaxro.pair(*photos, focal=FOCAL, mask=~wrong), select=lambda o: o.pose)
+    found, usable = jaxro.clean_batch(
+        jaxro.pair(*matched, focal=FOCAL),
+        RECOMMENDED,
+        select=lambda r: (r.orientation.pose, r.orientation.usable & (r.outcome == OUTCOMES.finished)),
+    )
+    turned = [np.stack([np.asarray(a) for a in jax.tree.leaves(pose)[:4]]) for pose in (found, right)]
+    angle = 2 * np.arccos(np.minimum(np.abs(np.sum(turned[0] * turned[1], axis=0)), 1))
+    assert np.mean(usable) >= 0.99
+    assert np.all(angle[np.asarray(usable)] < np.deg2rad(0.1))

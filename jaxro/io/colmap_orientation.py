@@ -26,7 +26,7 @@ from jax import lax
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float, Int
 
-from .. import coplanarity, critical_values, rotations as rot
+from .. import critical_values, rotations as rot
 from ..elements import RelativePose
 from ..normal_equations import accumulate, solve
 from ..orientation import orient
@@ -34,7 +34,7 @@ from ..pairs import Pair, cleaned
 from ..reductions import count
 from ..rejection.hypotheses import EightPoint, FivePoint, moved_up, squares, vectors
 from ..rejection.ransac import Ransac
-from ..rejection.robust import agreeing, improved, in_front
+from ..rejection.robust import agreeing, improved, in_front, parallel, seen
 from ..results import RESULTS, is_usable
 from ..starts.general import _rotation_only as rotation_only
 
@@ -116,7 +116,7 @@ def judged(pair: Pair, pose: RelativePose) -> Found:
     pose = lax.fori_loop(0, STEPS, nearer, pose)
     pose = visible(pair, pose, within(pose, 1.0), limit)
     pose, use = agreeing(pair, pose, within(pose, 1.0), limit, ROUNDS)
-    use = use & (in_front(pair, pose) | parallel(pair, pose, limit))
+    use = use & seen(pair, pose, limit)
     solved = orient(pair.with_mask(use), start=pose)
     pose, result = solved.pose, solved.result
     normal, _, share = plane(pair, pose, use, limit)
@@ -140,18 +140,6 @@ def judged(pair: Pair, pose: RelativePose) -> Found:
     rotation = rot.as_array(pose.relative()[0])
     kept = use & (kind < int(Kind.no_consensus))
     return Found(kept, pose.quaternion, rotation, pose.base, normal, solved.sigma0, kind)
-
-
-def parallel(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> Bool[Array, "match"]:
-    """The matches whose rays are parallel within `limit` standard deviations of the angle between them."""
-    rotation, base = pose.relative()
-
-    def one(point, sigma):
-        first, second, w2, *_ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
-        variance = sigma**2 * (1 / rot.dot(first, first) + 1 / rot.dot(second, second))
-        return w2 <= limit**2 * variance * rot.dot(first, first) * rot.dot(second, second)
-
-    return pair.mask & jax.vmap(one)(pair.coordinates, pair.sigma)
 
 
 def plane(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> Plane:

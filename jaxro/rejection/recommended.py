@@ -18,7 +18,7 @@ from .base import OUTCOMES, AbstractProcedure, Rejection
 from .graduated_non_convexity import GraduatedNonConvexity
 from .hypotheses import EightPoint, FivePoint, Newton
 from .ransac import Ransac
-from .robust import AbstractSearch, agreeing, in_front, judged, one_by_one, scaled
+from .robust import AbstractSearch, agreeing, in_front, judged, one_by_one, scaled, seen
 
 
 class Recommended(AbstractProcedure):
@@ -39,8 +39,9 @@ class Recommended(AbstractProcedure):
     How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) (u/(1-u))^(k-5) of such
     sets that agree by accident: p = limit / mean |r| of the rejected points is about the share of wrong points that
     agree by chance, u = `wrong` the share of wrong points expected beforehand, without which a dozen points that agree
-    beside three errors of ten sigma would count as an accident. Above `accidents` of a search the next one follows;
-    above the last of them the outcome is `no_consensus`.
+    beside three errors of ten sigma would count as an accident. Above `accidents` of a search, or with
+    less than this `share` of the points, which right ones may give a wrong pose as well, the next one follows; above
+    the last of `accidents` the outcome is `no_consensus`. A point behind a photo is rejected, unless infinitely far.
     """
 
     sigma: float | None = None
@@ -56,6 +57,7 @@ class Recommended(AbstractProcedure):
         Ransac(hypotheses=FivePoint(), count=128, limit=5.0),
     )
     accidents: tuple[float, ...] = (1e-4, 1e-3, 1e-3, 0.05, 0.05)
+    share: float = 0.3
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
@@ -66,10 +68,11 @@ class Recommended(AbstractProcedure):
         pose, use = self._found(self.searches[0], fixed, limit)
         expected = self._accidents(fixed, pose, use, limit)
         for search, most in zip(self.searches[1:], self.accidents, strict=False):
-            pose, use, expected = self._elsewhere(
-                search, fixed, limit, pose, use, expected, ~(expected <= math.log(most))
-            )
-        convinced = expected <= math.log(self.accidents[-1])
+            enough = count(use) >= self.share * count(fixed.mask)
+            needed = ~((expected <= math.log(most)) & enough)
+            pose, use, expected = self._elsewhere(search, fixed, limit, pose, use, expected, needed)
+        least = self.share if len(self.searches) == 1 else 0.0
+        convinced = (expected <= math.log(self.accidents[-1])) & (count(use) >= least * count(fixed.mask))
         verdict = judged(pair, pose, use, limit)
         return Rejection(
             verdict.mask,
@@ -82,9 +85,10 @@ class Recommended(AbstractProcedure):
 
     def stages(self) -> list["Recommended"]:
         """The searches as procedures of their own, for batches: each for the pairs that the one before left open."""
+        shares = [self.share] * (len(self.searches) - 1) + [0.0]
         return [
-            dataclasses.replace(self, searches=(search,), accidents=(most,))
-            for search, most in zip(self.searches, self.accidents, strict=True)
+            dataclasses.replace(self, searches=(search,), accidents=(most,), share=share)
+            for search, most, share in zip(self.searches, self.accidents, shares, strict=True)
         ]
 
     def _found(self, search: AbstractSearch, pair: Pair, limit: Float[Array, ""]):
@@ -97,7 +101,8 @@ class Recommended(AbstractProcedure):
         other, cost, rests = one_by_one(pair, pose, pair.mask, limit, self.rounds, few)
         convinces = self._accidents(pair, *other, limit) <= math.log(self.accidents[0])
         first = rests & ((cost < lowest) | convinces)
-        return jax.tree.map(lambda a, b: jnp.where(first, a, b), other, best)
+        pose, use = jax.tree.map(lambda a, b: jnp.where(first, a, b), other, best)
+        return pose, use & seen(pair, pose, limit)
 
     def _elsewhere(self, search, pair: Pair, limit, pose: RelativePose, use, expected, needed):
         """The same by another search where it is needed: a loop of at most one round, which under vmap is entered only

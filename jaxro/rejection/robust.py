@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .. import coplanarity
+from .. import coplanarity, rotations as rot
 from ..conditions import Linear, linearised
 from ..elements import RelativePose
 from ..normal_equations import accumulate, cholesky, solve, substitute
@@ -96,6 +96,23 @@ def in_front(pair: Pair, pose: RelativePose) -> Use:
     lam, mu = jax.vmap(depths)(pair.coordinates)
     front, behind = pair.mask & (lam > 0) & (mu > 0), pair.mask & (lam < 0) & (mu < 0)
     return jnp.where(count(front) >= count(behind), front, behind)
+
+
+def parallel(pair: Pair, pose: RelativePose, limit: ArrayLike) -> Use:
+    """The points whose rays are parallel within `limit` standard deviations of the angle between them."""
+    rotation, base = pose.relative()
+
+    def one(point, sigma):
+        first, second, w2, *_ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
+        variance = sigma**2 * (1 / rot.dot(first, first) + 1 / rot.dot(second, second))
+        return w2 <= jnp.asarray(limit, w2.dtype) ** 2 * variance * rot.dot(first, first) * rot.dot(second, second)
+
+    return pair.mask & jax.vmap(one)(pair.coordinates, pair.sigma)
+
+
+def seen(pair: Pair, pose: RelativePose, limit: ArrayLike) -> Use:
+    """The points that can be seen: in front of both photos, or so far that the sign of their depth says nothing."""
+    return in_front(pair, pose) | parallel(pair, pose, limit)
 
 
 def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int) -> tuple[RelativePose, Use]:
