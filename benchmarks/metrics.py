@@ -23,6 +23,11 @@ class Metric:
     tolerance: float = 0.25
     goal: float | None = None
 
+    @property
+    def of_the_machine(self) -> bool:
+        """Whether it is a time, which says nothing on another machine."""
+        return self.unit.split()[0] in ("s", "ms", "µs", "ns")
+
     def reaches(self, bound: float) -> bool:
         """Whether the value is at least as good as `bound`."""
         return self.value >= bound if self.direction == "higher" else self.value <= bound
