@@ -1,9 +1,9 @@
 """Many pairs at once, on every core.
 
 Pairs go through in slabs of fixed size, a slab in chunks that stay in the cache (`lax.map` over `vmap`), slabs spread
-over threads: XLA releases the interpreter lock and runs a chunk on one core, and nothing in the program calls LAPACK,
-which would deadlock. Pairs that do not start from the vertical are collected and oriented in a second, smaller pass,
-so that they do not hold up their chunk.
+over threads, and over the devices where there are several: XLA releases the interpreter lock and runs a chunk on one
+core, and nothing in the program calls LAPACK, which would deadlock. Pairs that do not start from the vertical are
+collected and oriented in a second, smaller pass, so that they do not hold up their chunk.
 """
 
 import math
@@ -244,8 +244,9 @@ def _slab_cleaned(pairs: Pair, *, procedure: AbstractProcedure, select: Callable
 def _spread(pairs: Pair, run: Program, way: Way, chunk: int, report: Report) -> PyTree:
     """All slabs through the program, as NumPy arrays."""
     total = pairs.x_left.shape[0]
+    devices = jax.local_devices()  # several GPUs take turns; a CPU is one, whose cores are the threads
     small = total * pairs.x_left.shape[1] <= ALONE
-    workers = way.threads or (1 if small else len(os.sched_getaffinity(0)))
+    workers = way.threads or (1 if small else max(len(os.sched_getaffinity(0)), 2 * len(devices)))
     if way.slab is not None:
         size = -(-way.slab // chunk) * chunk
     elif total <= chunk:
@@ -256,7 +257,14 @@ def _spread(pairs: Pair, run: Program, way: Way, chunk: int, report: Report) -> 
         share = -(-total // chunk) if workers == 1 else max(1, total // (4 * chunk * workers))
         size = chunk * min(most, 1 << share.bit_length() - 1)
     begins = range(0, total, size)
-    part = lambda begin: run(jax.tree.map(lambda a: _filled(a[begin : begin + size], size), pairs))
+
+    def part(begin: int) -> PyTree:
+        slab = jax.tree.map(lambda a: _filled(a[begin : begin + size], size), pairs)
+        if len(devices) == 1:
+            return run(slab)
+        with jax.default_device(devices[begin // size % len(devices)]):
+            return run(slab)
+
     shape = (size, pairs.x_left.shape[1], pairs.x_left.dtype)
     first = None
     if shape not in run.outputs:  # one call alone compiles; the threads then find the program ready

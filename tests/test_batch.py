@@ -1,6 +1,9 @@
 """Batches: the same results as one by one, from any thread, without LAPACK."""
 
+import os
 import re
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -92,3 +95,24 @@ def test_any_function_of_a_pair(pairs):
     np.testing.assert_array_equal(found["widest"], np.ptp(np.asarray(pairs.x_left), axis=1))
     np.testing.assert_array_equal(found["used"], pairs.mask)
     assert seen[-1] == (len(pairs.x_left),) * 2
+
+
+DEVICES = """
+import jax, numpy, jaxro
+from jaxro import batch
+
+used = set()
+call = batch.Program.__call__
+batch.Program.__call__ = lambda self, data: used.add(jax.config.jax_default_device) or call(self, data)
+x = numpy.arange(40000.0).reshape(2500, 16)
+pairs = jaxro.pair(x, x, x, x, focal=1.0)
+found = jaxro.map_batch(lambda pair: pair.x_left[0] + pair.y_right[1], pairs)
+assert len(jax.devices()) == 3 and used == set(jax.devices()), used
+numpy.testing.assert_array_equal(found, x[:, 0] + x[:, 1])
+"""
+
+
+def test_several_devices_take_turns():
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=3"}
+    done = subprocess.run([sys.executable, "-c", DEVICES], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
