@@ -23,6 +23,7 @@ pq = pytest.importorskip("pyarrow.parquet")
 
 FOCAL = 100.0
 PARTS = 12
+RENAME = os.replace
 
 
 def run(command, *arguments):
@@ -136,6 +137,11 @@ def test_a_killed_run_is_resumed_to_the_same_bytes(folder, whole):
     assert again.exit_code == 2 and "--resume" in again.output
     other = run("orient", folder / "table.parquet", "--focal", FOCAL + 1, "--out", out, "--resume")
     assert other.exit_code == 2 and "focal = 100.0 in the run to be resumed, 101.0 now" in other.output
+    times = (folder / "table.parquet").stat()
+    os.utime(folder / "table.parquet", ns=(times.st_atime_ns, times.st_mtime_ns + 1))
+    changed = run("orient", folder / "table.parquet", "--focal", FOCAL, "--out", out, "--resume")
+    assert changed.exit_code == 2 and "modified_ns" in changed.output
+    os.utime(folder / "table.parquet", ns=(times.st_atime_ns, times.st_mtime_ns))
     # a line that was cut off, a file that is not whole, and one that nobody knows of
     with (unfinished / JOURNAL).open("a") as file:
         file.write('{"part": 4, "pai')
@@ -173,6 +179,28 @@ def test_cleaning_keeps_every_row_with_its_verdict(folder, measured):
     q = cleaned.column("q_mm").to_numpy()
     np.testing.assert_allclose(q, [float(r["q_mm"] or "nan") for r in rows], atol=1e-8)
     assert pq.read_table(out / "residuals").num_rows == kept.sum()
+
+
+def test_the_exit_code_tells_of_pairs_that_are_not_cleaned(folder):
+    """As that of CSV tables: a pair that nothing was decided about is no success, whatever its orientation."""
+    finished = {"results": {"successful": 3, "two_solutions": 1}, "pairs": 4}
+    assert large.good(finished) and large.good(finished | {"outcomes": {"finished": 4}})
+    assert not large.good(finished | {"outcomes": {"finished": 3, "no_consensus": 1}})
+    assert not large.good({"results": {"successful": 3, "diverged": 1}, "pairs": 4})
+
+
+def test_a_run_that_is_killed_at_its_very_end_is_resumed(folder, whole, monkeypatch):
+    """Everything written, but the folder not yet renamed: no part is done again."""
+    out = folder / "last"
+    with monkeypatch.context() as stop:
+        stop.setattr(os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt) if b == out else RENAME(a, b))
+        with pytest.raises(KeyboardInterrupt):
+            stream(folder / "table.parquet", out)
+    assert not out.exists()
+    assert stream(
+        folder / "table.parquet", out, resume=True, engine=lambda job, told: [job.left[0]] if job.left else []
+    )
+    assert contents(out) == contents(whole)
 
 
 def test_a_pair_with_a_missing_number_harms_no_other(folder, measured, whole):

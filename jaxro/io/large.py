@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from .. import __version__
 from ..ragged import planned
@@ -17,7 +18,8 @@ from .console import consoles, progress
 from .job import Options
 from .records import TABLES, Recorder
 from .report import table as terminal_table
-from .streaming import CONVERTED, PART_ROWS, Job, Work, here, parts
+from .solutions import WARNED
+from .streaming import CONVERTED, JOURNAL, MODIFIED, PART_ROWS, Job, Work, here, parts
 from .tables import TableError
 from .tolerances import tolerances
 
@@ -33,7 +35,7 @@ class Large:
 
 
 def run(options: Options, large: Large, procedure: tuple[str, AbstractProcedure] | None = None) -> bool:
-    """Plan, work, tell. True if every pair is usable. Raises TableError; what is finished then can be resumed."""
+    """Plan, work, tell. True if every pair is cleaned and usable. Raises TableError; finished parts can be resumed."""
     started = time.monotonic()
     console, errors = consoles()
     job = prepared(options, large, procedure)
@@ -44,7 +46,14 @@ def run(options: Options, large: Large, procedure: tuple[str, AbstractProcedure]
             job.finished(entry)
     summary = job.end()
     show(console, job, summary, time.monotonic() - started)
-    return summary["results"].get("successful", 0) + summary["results"].get("no_redundancy", 0) == job.pairs
+    return good(summary)
+
+
+def good(summary: dict[str, Any]) -> bool:
+    """Whether every pair is cleaned, where that was asked for, and usable."""
+    usable = sum(summary["results"].get(name, 0) for name in ("successful", *WARNED))
+    finished = summary["outcomes"].get("finished", 0) if "outcomes" in summary else summary["pairs"]
+    return usable == finished == summary["pairs"]
 
 
 def prepared(options: Options, large: Large, procedure: tuple[str, AbstractProcedure] | None) -> Job:
@@ -79,7 +88,7 @@ def _planned(
     source = options.file
     if source.suffix != ".parquet":
         source = folder / CONVERTED
-        if not (large.resume and source.exists()):
+        if not (large.resume and source.exists() and (folder / JOURNAL).exists()):
             folder.mkdir(parents=True, exist_ok=True)
             parquet.converted(options.file, source)
     table = parquet.Source(source)
@@ -122,7 +131,9 @@ def _request(options: Options, tables: tuple[str, ...], procedure: tuple[str, Ab
     """What is asked for, as the journal and the summary keep it; another request does not resume a run."""
     assert options.file is not None
     asked: dict[str, Any] = {"program": f"jaxro {__version__}", "file": str(options.file)}
-    asked |= {"bytes": options.file.stat().st_size, "tables": list(tables)}
+    read = [file for file in (options.file, options.camera) if file is not None]
+    asked |= {"bytes": options.file.stat().st_size, MODIFIED: [file.stat().st_mtime_ns for file in read]}
+    asked["tables"] = list(tables)
     named = {"camera", "focal", "principal_point", "pixel_size", "y_down", "sigma", "elements", "base", "residual"}
     asked |= {name: _plain(getattr(options, name)) for name in sorted(named | {"unit"})}
     asked["elements"] = options.elements or "relative"
@@ -146,6 +157,6 @@ def show(console: Console, job: Job, summary: dict[str, Any], seconds: float) ->
     doubles = summary["pairs_with_two_points_of_one_name"]
     if doubles:
         named = ", ".join(doubles[:5]) + (", ..." if len(doubles) > 5 else "")
-        console.print(f"[yellow]Mind:[/yellow] two points of one name in pairs {named}", markup=True)
+        console.print(f"[yellow]Mind:[/yellow] two points of one name in pairs {escape(named)}")
     rate = f"{summary['pairs']:,} pairs, {summary['rows']:,} points in {seconds:.1f} s"
     console.print(f"{rate}. Written to {job.target}: {', '.join(job.work.recorder.tables)}, summary.json", markup=False)

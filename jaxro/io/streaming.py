@@ -36,6 +36,9 @@ PART_ROWS = 1 << 19
 
 JOURNAL = "journal.jsonl"
 
+MODIFIED = "modified_ns"
+"""When the files that were read were written: part of a request, by which another one is known, not of a summary."""
+
 CONVERTED = "input.parquet"
 """A CSV table while it is worked on."""
 
@@ -217,9 +220,10 @@ class Job:
             whole |= {key: dict(sorted(total.items()))} if total else {}
         doubles = [name for entry in self.entries for name in entry["doubles"]]
         whole["pairs_with_two_points_of_one_name"] = doubles
-        summary = {**self.request, **whole, "units": asdict(self.work.units)}
+        asked = {key: value for key, value in self.request.items() if key != MODIFIED}
+        summary = {**asked, **whole, "units": asdict(self.work.units)}
         (folder / "summary.json").write_text(json_text(summary), encoding="utf-8")
-        for stray in (*folder.rglob("*.partial"), folder / CONVERTED, folder / JOURNAL):
+        for stray in (*folder.rglob("*.partial"), folder / CONVERTED):
             stray.unlink(missing_ok=True)
         if self.target.exists():
             old = self.target.with_name(f".{self.target.name}.{os.getpid()}.old")
@@ -228,6 +232,7 @@ class Job:
             shutil.rmtree(old)
         else:
             os.replace(folder, self.target)
+        (self.target / JOURNAL).unlink()  # last: a run that is stopped before can still be resumed
         return whole
 
     def _journal(self, entry: dict[str, Any], mode: str = "a") -> None:
