@@ -6,10 +6,7 @@ core, and nothing in the program calls LAPACK, which would deadlock. Pairs that 
 collected and oriented in a second, smaller pass, so that they do not hold up their chunk.
 """
 
-import math
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +18,7 @@ from .orientation import Orientation, orient, orient_near
 from .pairs import Pair
 from .programs import FAST, WIDE, Program
 from .rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
+from .slabs import Report, Way, spread, unheard
 from .starts import AbstractStart, Auto
 
 CHUNK_POINTS = 16384
@@ -32,12 +30,11 @@ SEARCHED = 32
 GENERAL = 8
 """Pairs per chunk of the general start, which goes on until the last pair of its chunk is served."""
 
+ALONE = 1 << 14
+"""Points of a batch that are oriented from the vertical before other threads have begun."""
+
 FEW = 32
 """Points up to which wider vectors gain (3 to 10 %); with more they lose."""
-
-SLAB_POINTS = 1 << 17
-"""Points per call of the compiled program: long enough to hide the call, short enough that the memory of one result is
-used again for the next and that progress is seen."""
 
 
 def _everything(result: Any) -> Any:
@@ -52,22 +49,6 @@ class Selected(NamedTuple):
     def __call__(self, pair: Pair, orientation: Orientation) -> PyTree:
         """What is kept."""
         return self.select(orientation)
-
-
-class Way(NamedTuple):
-    """How pairs go through: threads (all cores), pairs per chunk (by the number of points), and pairs per call of the
-    program (by the number of pairs; given, all calls have one shape), each as it is best where it is None."""
-
-    threads: int | None = None
-    chunk: int | None = None
-    slab: int | None = None
-
-
-Report = Callable[[int, int], None]
-
-
-def unheard(done: int, total: int) -> None:
-    """Progress that nobody asked for."""
 
 
 def orient_batch(
@@ -109,7 +90,7 @@ def settled(dtype: Any, options: dict[str, Any]) -> dict[str, Any]:
 def oriented(pairs: Pair, options: dict[str, Any], way: Way = Way(), report: Report = unheard) -> PyTree:  # noqa: B008
     """read(pair, orientation) of every pair, in NumPy; `options`: read, start, and those of `orient`."""
     chunk = _chunk(pairs, way.chunk)
-    return _spread(pairs, Program(_slab, options | {"chunk": chunk}, _settings(pairs)), way, chunk, report)
+    return spread(pairs, Program(_slab, options | {"chunk": chunk}, _settings(pairs)), way, chunk, report)
 
 
 def oriented_near(
@@ -120,7 +101,9 @@ def oriented_near(
 ) -> tuple[PyTree, np.ndarray]:
     """The same from the vertical, and for which pairs that fits; `options["start"]` is an `Auto`."""
     chunk = _chunk(pairs, way.chunk)
-    return _spread(pairs, Program(_slab_near, options | {"chunk": chunk}, _settings(pairs)), way, chunk, report)
+    if pairs.x_left.size <= ALONE:
+        way = way._replace(threads=way.threads or 1, calls=0)
+    return spread(pairs, Program(_slab_near, options | {"chunk": chunk}, _settings(pairs)), way, chunk, report)
 
 
 def _replace(out: PyTree, rows: np.ndarray, new: PyTree) -> None:
@@ -167,7 +150,7 @@ def decided(
     if _by_subsets(procedure) and way.chunk is None:
         chunk = min(chunk, SEARCHED)
     program = Program(_slab_cleaned, {"procedure": procedure, "select": select, "chunk": chunk}, _settings(pairs))
-    return _spread(pairs, program, way, chunk, report)
+    return spread(pairs, program, way, chunk, report)
 
 
 def map_batch(
@@ -186,7 +169,7 @@ def map_batch(
     chunk = _chunk(pairs, chunk)
     program = Program(_slab_mapped, {"function": function, "chunk": chunk}, _settings(pairs))
     host, way = jax.tree.map(np.asarray, pairs), Way(threads, chunk)
-    return _finish(_spread(host, program, way, chunk, progress or unheard))
+    return _finish(spread(host, program, way, chunk, progress or unheard))
 
 
 def _by_subsets(procedure: AbstractProcedure) -> bool:
@@ -239,79 +222,6 @@ def _slab_cleaned(pairs: Pair, *, procedure: AbstractProcedure, select: Callable
         return select(rejection), rejection.outcome == OUTCOMES.no_consensus
 
     return _chunked(one, pairs, chunk)
-
-
-def _spread(pairs: Pair, run: Program, way: Way, chunk: int, report: Report) -> PyTree:
-    """All slabs through the program, as NumPy arrays."""
-    total = pairs.x_left.shape[0]
-    devices = jax.local_devices()  # several GPUs take turns; a CPU is one, whose cores are the threads
-    small = total * pairs.x_left.shape[1] <= ALONE
-    workers = way.threads or (1 if small else max(len(os.sched_getaffinity(0)), 2 * len(devices)))
-    if way.slab is not None:
-        size = -(-way.slab // chunk) * chunk
-    elif total <= chunk:
-        size = 1 << max(total - 1, 0).bit_length()
-    else:
-        most = max(1, SLAB_POINTS // (chunk * max(pairs.x_left.shape[1], 1)))
-        # four calls a thread, so that none waits long for the last; few sizes: each is another program
-        share = -(-total // chunk) if workers == 1 else max(1, total // (4 * chunk * workers))
-        size = chunk * min(most, 1 << share.bit_length() - 1)
-    begins = range(0, total, size)
-
-    def part(begin: int) -> PyTree:
-        slab = jax.tree.map(lambda a: _filled(a[begin : begin + size], size), pairs)
-        if len(devices) == 1:
-            return run(slab)
-        with jax.default_device(devices[begin // size % len(devices)]):
-            return run(slab)
-
-    shape = (size, pairs.x_left.shape[1], pairs.x_left.dtype)
-    first = None
-    if shape not in run.outputs:  # one call alone compiles; the threads then find the program ready
-        first = part(0)
-        run.outputs[shape] = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), first)
-    out = jax.tree.map(lambda a: _empty((total, *a.shape[1:]), a.dtype), run.outputs[shape])
-
-    def store(begin: int, result: PyTree) -> int:
-        end = min(begin + size, total)
-        for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(result), strict=True):
-            target[begin:end] = np.asarray(source)[: end - begin]
-        return end - begin
-
-    work = lambda begin: store(begin, part(begin) if first is None or begin else first)
-    done = 0
-    if len(begins) == 1 or workers == 1:
-        for begin in begins:
-            done += work(begin)
-            report(done, total)
-        return out
-    with ThreadPoolExecutor(workers) as pool:
-        for future in as_completed([pool.submit(work, begin) for begin in begins]):
-            done += future.result()
-            report(done, total)
-    return out
-
-
-def _filled(a: np.ndarray, size: int) -> np.ndarray:
-    """The array with zeros (mask False: empty pairs) up to `size` rows."""
-    if a.shape[0] == size:
-        return a
-    return np.concatenate([a, np.zeros((size - a.shape[0], *a.shape[1:]), a.dtype)])
-
-
-ALONE = 1 << 14
-"""Points of a batch that are done before other threads have begun."""
-
-ALIGNMENT = 64
-"""Bytes to which JAX wants memory that it takes over without a copy."""
-
-
-def _empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """Memory for a result, aligned as JAX wants it."""
-    size = math.prod(shape) * dtype.itemsize
-    room = np.empty(size + ALIGNMENT, np.uint8)
-    start = -room.ctypes.data % ALIGNMENT
-    return room[start : start + size].view(dtype).reshape(shape)
 
 
 def _finish(out: PyTree) -> PyTree:

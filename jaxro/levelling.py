@@ -115,6 +115,7 @@ def adjust_heights(
     fixed = known[network.fixed]
     observations = network.first, network.last, whole
 
+    # derivatives come from one step from the solution, in `_refined`, not through the solver
     held = lax.stop_gradient(fixed)
 
     def condition(free, observation):

@@ -238,6 +238,7 @@ def test_every_pair_gets_what_it_is_worth(tmp_path):
     }
     sizes = {name: len(g.inlier_matches) for name, g in found.items()}
     assert sizes["chance"] == sizes["few"] == sizes["none"] == 0 and sizes["ten"] == 12
+    # by LEVEL one pair in three loses a right match, one in two hundred three of them
     assert 94 <= sizes["oriented"] <= 99 and 125 <= sizes["plane"] <= 131 and sizes["rotation"] >= 156
     for name in ("oriented", "ten"):
         pose = found[name].cam2_from_cam1

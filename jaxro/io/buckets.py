@@ -1,7 +1,6 @@
-"""Pairs of every length in few batches: padded to a power of two, so that few programs are compiled."""
+"""Pairs of every length in few batches, with what is asked of each."""
 
 import sys
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 
 import jax
@@ -9,9 +8,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..pairs import Pair
-
-CHEAP = 1_000_000
-"""Padded points that take less time to calculate than another program takes to compile."""
+from ..ragged import sizes
 
 
 def each(
@@ -44,20 +41,12 @@ def each(
 
 
 def buckets(lengths: list[int]) -> dict[int, list[int]]:
-    """Indices of the pairs to be padded to each number of points, a power of two of at least 8.
-
-    A few short pairs go along with longer ones: calculating with their padding is cheaper than compiling once more.
-    """
-    exact: dict[int, list[int]] = defaultdict(list)
-    for i, length in enumerate(lengths):
-        exact[max(8, 1 << (length - 1).bit_length())].append(i)
-    out: dict[int, list[int]] = {}
-    size = 0
-    for own in sorted(exact, reverse=True):
-        if not out or len(exact[own]) * size > CHEAP:
-            size = own
-        out.setdefault(size, []).extend(exact[own])
-    return out
+    """Indices of the pairs to be padded to each of `ragged.sizes`."""
+    known = np.asarray(lengths, int)
+    chosen = sizes(known)
+    place = np.searchsorted(chosen, known)
+    every = {size: np.flatnonzero(place == k).tolist() for k, size in enumerate(chosen)}
+    return {size: members for size, members in every.items() if members}
 
 
 def _batch(pairs: list[Pair], size: int) -> Pair:

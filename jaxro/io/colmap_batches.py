@@ -1,17 +1,16 @@
 """The matched pairs of a database as padded batches, through search and judgement on all cores."""
 
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PyTree
+from jaxtyping import Float, Int
 
 from ..pairs import Pair
 from ..programs import Program
 from ..rejection.ransac import Ransac
+from ..slabs import Way, spread
 from .buckets import buckets
 from .colmap_cameras import PhotoPoints
 from .colmap_orientation import EIGHT, FIVE, SEARCHED, Found, Kind, judged, searched, suffices
@@ -80,8 +79,11 @@ def _found(block: Block, points: PhotoPoints, size: int, sigma: float, told: Cal
 
 def _by(search: Ransac, few: Fields, every: Fields, told: Callable[[int], None]) -> tuple[Found, np.ndarray]:
     """What was found by this search, and where it sufficed."""
-    pose, tried = _each(_all_searched, few, max(1, IN_CACHE // 8 // few[0].shape[1]), told, search=search)
-    found = _each(_all_judged, (every, pose), max(1, IN_CACHE // every[0].shape[1]), lambda count: None)
+    chunk = max(1, IN_CACHE // 8 // few[0].shape[1])
+    heard = lambda done, total: told(done)
+    pose, tried = spread(few, Program(_all_searched, {"search": search}), Way(slab=chunk), chunk, heard)
+    chunk = max(1, IN_CACHE // every[0].shape[1])
+    found = spread((every, pose), Program(_all_judged, {}), Way(slab=chunk), chunk)
     return found, suffices(search, tried, np.sum(found.kept, axis=1), np.sum(every[5], axis=1))
 
 
@@ -110,29 +112,3 @@ def batch(block: Block, points: PhotoPoints, size: int, sigma: float) -> Fields:
     scale = np.sqrt((points.scale[left] ** 2 + points.scale[right] ** 2) / 2)
     coordinates = [fill(a, 0.0) for a in (points.x[left], points.y[left], points.x[right], points.y[right])]
     return *coordinates, fill(sigma * scale, 1.0), there, block.focal_left, block.focal_right
-
-
-def _each(function: Callable, data: PyTree, chunk: int, told: Callable[[int], None], **options) -> PyTree:
-    """function(data) in chunks of one size on all cores, as NumPy arrays; the last chunk repeats its last row."""
-    total = len(jax.tree.leaves(data)[0])
-    run = Program(function, options)
-
-    def part(begin: int) -> PyTree:
-        rows = np.minimum(np.arange(begin, begin + chunk), total - 1)
-        return jax.tree.map(np.asarray, run(jax.tree.map(lambda a: a[rows], data)))
-
-    first = part(0)  # alone, so that it is compiled once
-    out = jax.tree.map(lambda a: np.empty((total, *a.shape[1:]), a.dtype), first)
-    done = 0
-
-    def store(begin: int) -> int:
-        end = min(begin + chunk, total)
-        for target, new in zip(jax.tree.leaves(out), jax.tree.leaves(part(begin) if begin else first), strict=True):
-            target[begin:end] = new[: end - begin]
-        return end - begin
-
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        for count in pool.map(store, range(0, total, chunk)):
-            done += count
-            told(done)
-    return out

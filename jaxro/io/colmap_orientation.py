@@ -36,7 +36,7 @@ from ..rejection.hypotheses import EightPoint, FivePoint, moved_up, squares, vec
 from ..rejection.ransac import Ransac
 from ..rejection.robust import agreeing, improved, in_front, parallel, seen
 from ..results import RESULTS, is_usable
-from ..starts.general import _rotation_only as rotation_only
+from ..starts.general import rotation_only
 
 SEARCHED = 256
 EIGHT = Ransac(EightPoint(block=8), count=128, confidence=0.9, limit=5.0)

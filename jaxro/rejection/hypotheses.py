@@ -21,7 +21,7 @@ from ..starts import AbstractStart, Vertical
 from ..starts.decomposition import best_pose
 from ..starts.eight_point import eight_point
 from ..starts.five_point import five_point
-from ..starts.general import _vectors as vectors
+from ..starts.general import vectors
 
 Poses = tuple[RelativePose, Bool[Array, "..."]]
 """Orientations on a leading axis, and which of them exist."""

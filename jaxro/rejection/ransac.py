@@ -101,7 +101,8 @@ class Ransac(AbstractSearch):
         """How many subsets hold one of agreeing points alone with probability `confidence`."""
         share = math.prod(jnp.maximum(agree - k, 0.0) / jnp.maximum(of - k, 1.0) for k in range(self.hypotheses.size))
         share = jnp.clip(share, CERTAIN, 1 - CERTAIN)
-        return math.log1p(-self.confidence) / jnp.log1p(-share)
+        # too few points for a subset, as in the empty pairs that fill up a batch: it would wait for them
+        return jnp.where(of < self.hypotheses.size, 0.0, math.log1p(-self.confidence) / jnp.log1p(-share))
 
 
 def score(squares: Float[Array, "point"], limit: float) -> Float[Array, ""]:

@@ -39,7 +39,7 @@ class General(AbstractStart):
     steps: int = 6
 
     def __call__(self, pair: Pair) -> Begin:
-        left, right = _vectors(pair)
+        left, right = vectors(pair)
         poses, real = self._candidates(pair, left, right)
         score = jnp.where(real, _scores(pair, poses, left, right), jnp.inf)
         chosen, found = _best_different(poses, score, self.refined)
@@ -52,7 +52,7 @@ class General(AbstractStart):
         slack = jnp.where(freedom > 0, 10 / jnp.where(freedom > 0, freedom, 1.0), 0.0)
         ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
         ambiguous = ambiguous & (other < squares * (1 + slack) + 1e-18)
-        turn, parallax = _rotation_only(left, right, pair.mask)
+        turn, parallax = rotation_only(left, right, pair.mask)
         noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
         pure = parallax < significant(freedom) * noise + 1e-9
         pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
@@ -73,7 +73,7 @@ class General(AbstractStart):
         return poses, jnp.concatenate([real, jnp.ones(1, bool)])
 
 
-def _vectors(pair: Pair) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
+def vectors(pair: Pair) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
     """Image vectors p / f."""
     of = lambda x, y, f: jnp.stack([x / f, y / f, -jnp.ones_like(x)], axis=-1)
     return of(pair.x_left, pair.y_left, pair.focal_left), of(pair.x_right, pair.y_right, pair.focal_right)
@@ -141,7 +141,7 @@ def _refined(pair: Pair, pose: RelativePose, count: int) -> RelativePose:
     return jax.tree.map(lambda new, old: jnp.where(better, new, old), moved, pose)
 
 
-def _rotation_only(left, right, mask) -> tuple[RelativePose, Float[Array, ""]]:
+def rotation_only(left, right, mask) -> tuple[RelativePose, Float[Array, ""]]:
     """The rotation that best turns the right directions into the left ones, and the parallax (rad) it leaves.
 
     The quaternion is the eigenvector of Davenport's 4x4 matrix of the largest eigenvalue, found by repeated squaring.

@@ -1,0 +1,114 @@
+"""A compiled program over many pairs: slabs of one size, spread over threads and devices.
+
+XLA releases the interpreter lock and runs a slab on one core; no program that goes through here may call LAPACK, which
+would wait for itself for ever.
+"""
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from .programs import Program
+
+SLAB_POINTS = 1 << 17
+"""Points per call of the compiled program: long enough to hide the call, short enough that the memory of one result is
+used again for the next and that progress is seen."""
+
+
+ALIGNMENT = 64
+"""Bytes to which JAX wants memory that it takes over without a copy."""
+
+
+class Way(NamedTuple):
+    """How pairs go through: threads (all cores), pairs per chunk (by the number of points), and pairs per call of the
+    program (by the number of pairs; given, all calls have one shape), each as it is best where it is None; calls per
+    core at least, so that no thread waits long for the last (0: one call if it may be). The results are the same bits
+    with any number of threads."""
+
+    threads: int | None = None
+    chunk: int | None = None
+    slab: int | None = None
+    calls: int = 4
+
+
+Report = Callable[[int, int], None]
+
+
+def unheard(done: int, total: int) -> None:
+    """Progress that nobody asked for."""
+
+
+def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = unheard) -> PyTree:
+    """run(data) of everything on the leading axis, slab by slab, as NumPy arrays; `chunk` divides a slab.
+
+    What the last slab lacks are zeros: empty pairs. `report` is called from the calling thread.
+    """
+    leaves = jax.tree.leaves(data)
+    total, points = leaves[0].shape[0], math.prod(leaves[0].shape[1:])
+    devices = jax.local_devices()  # several GPUs take turns; a CPU is one, whose cores are the threads
+    cores = max(len(os.sched_getaffinity(0)), 2 * len(devices))
+    workers = way.threads or cores
+    if way.slab is not None:
+        size = -(-way.slab // chunk) * chunk
+    elif total <= chunk:
+        size = 1 << max(total - 1, 0).bit_length()
+    else:
+        most = max(1, SLAB_POINTS // (chunk * max(points, 1)))
+        share = max(1, total // (way.calls * cores * chunk)) if way.calls else -(-total // chunk)
+        # few sizes: each is another program
+        size = chunk * min(most, 1 << share.bit_length() - 1)
+    begins = range(0, total, size)
+
+    def part(begin: int) -> PyTree:
+        slab = jax.tree.map(lambda a: _filled(a[begin : begin + size], size), data)
+        if len(devices) == 1:
+            return run(slab)
+        with jax.default_device(devices[begin // size % len(devices)]):
+            return run(slab)
+
+    shape = (size, points, leaves[0].dtype)
+    first = None
+    if shape not in run.outputs:  # one call alone compiles; the threads then find the program ready
+        first = part(0)
+        run.outputs[shape] = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), first)
+    out = jax.tree.map(lambda a: _empty((total, *a.shape[1:]), a.dtype), run.outputs[shape])
+
+    def store(begin: int, result: PyTree) -> int:
+        end = min(begin + size, total)
+        for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(result), strict=True):
+            target[begin:end] = np.asarray(source)[: end - begin]
+        return end - begin
+
+    work = lambda begin: store(begin, part(begin) if first is None or begin else first)
+    done = 0
+    if len(begins) == 1 or workers == 1:
+        for begin in begins:
+            done += work(begin)
+            report(done, total)
+        return out
+    with ThreadPoolExecutor(workers) as pool:
+        for future in as_completed([pool.submit(work, begin) for begin in begins]):
+            done += future.result()
+            report(done, total)
+    return out
+
+
+def _filled(a: np.ndarray, size: int) -> np.ndarray:
+    """The array with zeros (mask False: empty pairs) up to `size` rows."""
+    if a.shape[0] == size:
+        return a
+    return np.concatenate([a, np.zeros((size - a.shape[0], *a.shape[1:]), a.dtype)])
+
+
+def _empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Memory for a result, aligned as JAX wants it."""
+    size = math.prod(shape) * dtype.itemsize
+    room = np.empty(size + ALIGNMENT, np.uint8)
+    start = -room.ctypes.data % ALIGNMENT
+    return room[start : start + size].view(dtype).reshape(shape)
