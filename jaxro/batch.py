@@ -24,7 +24,7 @@ from .starts import AbstractStart, Auto
 CHUNK_POINTS = 16384
 """Points per chunk: a working set of a few hundred kB, which stays in the cache of one core."""
 
-SEARCHED = 32
+SEARCHED = 16
 """Pairs per chunk at most where random subsets are tried."""
 
 GENERAL = 8

@@ -10,13 +10,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .. import coplanarity
+from .. import coplanarity, rotations as rot
 from ..adjustment import Residuals
 from ..elements import RelativePose
 from ..normal_equations import solve
 from ..pairs import Pair
 from ..programs import stage
 from ..reductions import count
+from ..rotations import Matrix, Vector
 from ..starts import AbstractStart, Vertical
 from ..starts.decomposition import best_pose
 from ..starts.eight_point import eight_point
@@ -53,7 +54,7 @@ class FivePoint(AbstractHypotheses):
 
     def __call__(self, subset: Pair, begin: None) -> Poses:
         left, right = vectors(subset)
-        essentials, real = five_point(left, right)
+        essentials, real = five_point(left, right, polished=False)
         poses, front = jax.vmap(lambda e: best_pose(e, left, right, subset.mask))(essentials)
         return poses, real & (front == self.size)
 
@@ -106,24 +107,27 @@ def refined(subset: Pair, pose: RelativePose, steps: int) -> tuple[RelativePose,
     points = [tuple(single(c[i]) for c in subset.coordinates) for i in range(subset.x_left.shape[0])]
     zero, one = jnp.zeros_like(left), jnp.ones_like(left)
 
-    def linearised(pose: RelativePose):
-        """F and its derivatives by the five parameters."""
-        slopes = []
-        for k in range(5):
-            at = lambda x, k=k: pose.moved((zero,) * k + (x,) + (zero,) * (4 - k))
-            f, slope = jax.jvp(lambda x, at=at: coplanarity.fundamental_matrix(at(x), left, right), (zero,), (one,))
-            slopes.append(slope)
-        return [*slopes, f]
+    def condition(turn: Vector, base: Vector, rotation: Matrix, point) -> Array:
+        """g with the right photo turned about its own axes: one gradient of it, where `pose.moved` takes five slopes."""
+        x1, y1, x2, y2 = point
+        p2 = (x2, y2, -right)
+        turned = tuple(a + b for a, b in zip(p2, rot.cross(turn, p2), strict=True))
+        return rot.dot(base, rot.cross((x1, y1, -left), rot.apply(rotation, turned)))  # pyright: ignore[reportArgumentType]
 
-    def rows(matrices):
-        """g is linear in F, so that its derivatives are g of those of F."""
-        return [[coplanarity.condition(f, point) for f in matrices] for point in points]
+    def rows(pose: RelativePose):
+        rotation, base = pose.relative()
+        tangents = rot.tangents(base)
+        each = []
+        for point in points:
+            g, (turn, n) = jax.value_and_grad(condition, argnums=(0, 1))((zero,) * 3, base, rotation, point)
+            each.append([*turn, *(rot.dot(t, n) for t in tangents), g])
+        return each
 
     def normal(rows):
         return [[sum(row[i] * row[j] for row in rows) for j in range(i + 1)] for i in range(6)]
 
     def step(_, pose: RelativePose):
-        *n, (*h, _) = stage(normal)(stage(rows)(stage(linearised)(pose)))
+        *n, (*h, _) = stage(normal)(stage(rows)(pose))
         return pose.moved(tuple(-d for d in solve(n, h)))
 
     pose = lax.fori_loop(0, steps, step, jax.tree.map(single, pose))
@@ -134,22 +138,18 @@ def refined(subset: Pair, pose: RelativePose, steps: int) -> tuple[RelativePose,
 def draws(hypotheses: AbstractHypotheses, count: int, seed: int) -> Float[Array, "block place subset"]:
     """Uniform random numbers for `count` subsets, the same for every pair."""
     shape = -(-count // hypotheses.block), hypotheses.size, hypotheses.block
-    return jnp.asarray(np.random.default_rng(seed).random(shape))
+    return jnp.asarray(np.random.default_rng(seed).random(shape, np.float32))
 
 
 def subsets(uniform: Float[Array, "place subset"], of: Float[Array, ""]) -> Int[Array, "place subset"]:
-    """Different numbers below `of` in ascending order, as many as there are places, every choice equally likely."""
+    """Different numbers below `of`, as many as there are places, every choice equally likely (Floyd's algorithm: each
+    is drawn from one number more than the one before, and is the new one where it would repeat another)."""
     taken: list = []
-    for j in range(uniform.shape[0]):
-        rest = jnp.maximum(of - j, 1.0)
-        larger = jnp.minimum(jnp.floor(uniform[j] * rest), rest - 1)
-        for other in taken:  # the number counts those that are left
-            larger = larger + jnp.where(larger >= other, 1.0, 0.0)
-        ascending = []
-        for other in taken:
-            ascending.append(jnp.minimum(other, larger))
-            larger = jnp.maximum(other, larger)
-        taken = [*ascending, larger]
+    for j in reversed(range(uniform.shape[0])):
+        last = jnp.maximum(of.astype(uniform.dtype) - j, 1.0) - 1
+        number = jnp.minimum(jnp.floor(uniform[j] * (last + 1)), last)
+        again = sum((number == other for other in taken), start=jnp.zeros(number.shape, bool))
+        taken.append(jnp.where(again, last, number))
     return jnp.stack(taken).astype(jnp.int32)
 
 

@@ -85,7 +85,10 @@ class Ransac(AbstractSearch):
             return Found(pose, pick(lower, old.score), old.blocks + 1, self.enough(agree, count(pair.mask)))
 
         zero = jnp.zeros_like(pair.focal_left)
-        return lax.while_loop(more, searched, Found(vertical(zero), zero + jnp.inf, zero.astype(int), zero + jnp.inf))
+        # an empty pair, of those that fill up a batch, would run through all subsets
+        wanted = jnp.where(count(pair.mask) >= self.hypotheses.size, jnp.inf, zero)
+        start = Found(vertical(zero), zero + jnp.inf, zero.astype(int), wanted)
+        return lax.while_loop(more, searched, start)
 
     def optimised(self, pair: Pair, pose: RelativePose) -> RelativePose:
         """Gauss-Newton on the points within the wider limit, at last on those within the limit."""
@@ -101,8 +104,7 @@ class Ransac(AbstractSearch):
         """How many subsets hold one of agreeing points alone with probability `confidence`."""
         share = math.prod(jnp.maximum(agree - k, 0.0) / jnp.maximum(of - k, 1.0) for k in range(self.hypotheses.size))
         share = jnp.clip(share, CERTAIN, 1 - CERTAIN)
-        # too few points for a subset, as in the empty pairs that fill up a batch: it would wait for them
-        return jnp.where(of < self.hypotheses.size, 0.0, math.log1p(-self.confidence) / jnp.log1p(-share))
+        return math.log1p(-self.confidence) / jnp.log1p(-share)
 
 
 def score(squares: Float[Array, "point"], limit: float) -> Float[Array, ""]:

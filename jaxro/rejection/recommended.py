@@ -52,7 +52,7 @@ class Recommended(AbstractProcedure):
     searches: tuple[AbstractSearch, ...] = (
         GraduatedNonConvexity(),
         Ransac(hypotheses=Newton(), count=32, limit=5.0),
-        Ransac(hypotheses=EightPoint(), count=128, confidence=0.99, limit=5.0),
+        Ransac(hypotheses=EightPoint(), count=128, confidence=0.9, limit=5.0),
         Ransac(hypotheses=Newton(), count=1024, limit=5.0),
         Ransac(hypotheses=FivePoint(), count=128, limit=5.0),
     )

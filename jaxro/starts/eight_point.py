@@ -2,15 +2,15 @@
 
 Hartley 1997, In defense of the eight-point algorithm: each photo's coordinates are first centred and scaled. The nine
 entries of E are the eigenvector of the smallest eigenvalue of the 9x9 matrix of sums; it is the column to which the
-powers of the inverse tend, so no eigenvalue routine is needed. Points in one plane do not determine E this way.
+powers of the inverse tend, so no eigenvalue routine is needed. Eight points have their one E exactly, at right angles
+to the eight rows. Points in one plane do not determine E this way.
 """
-
-from functools import partial
 
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from .null_space import null_space
 from .problems_last import problems_last
 
 TINY = 1e-300
@@ -25,17 +25,16 @@ def eight_point(
 
     Of full rank where the coordinates are measured: `decomposition` finds the orientation nearest to it.
     """
-    # eight points leave an eigenvalue of zero: its vector is all there is of the inverse
     return (_exact if len(left) == 8 else _overdetermined)(left, right, weights)
 
 
-def _solve(squarings: int, left: Float[Array, "point 3 problem"], right, weights: Float[Array, "point problem"]):
+def _solve(left: Float[Array, "point 3 problem"], right, weights: Float[Array, "point problem"]):
     weights = weights / jnp.maximum(jnp.sum(weights, axis=0, keepdims=True), TINY)
     first, second = _conditioning(left, weights), _conditioning(right, weights)
     p1, p2 = (jnp.sum(t[None] * p[:, None], axis=2) for t, p in ((first, left), (second, right)))
     rows = (p1[:, :, None] * p2[:, None]).reshape(len(left), 9, -1)
     sums = jnp.sum((weights[:, None] * rows)[:, :, None] * rows[:, None], axis=0)
-    e = _smallest_eigenvector(sums, squarings).reshape(3, 3, -1)
+    e = _smallest_eigenvector(sums).reshape(3, 3, -1)
     e = jnp.sum(first[:, :, None] * e[:, None], axis=0)
     e = jnp.sum(e[:, :, None] * second[None], axis=1)
     return e / jnp.sqrt(jnp.maximum(jnp.sum(e * e, axis=(0, 1), keepdims=True), TINY))
@@ -50,10 +49,15 @@ def _conditioning(p: Float[Array, "point 3 problem"], weights: Float[Array, "poi
     return jnp.stack([jnp.stack([s, zero, s * x]), jnp.stack([zero, s, s * y]), jnp.stack([zero, zero, one])])
 
 
-_exact, _overdetermined = (problems_last(partial(_solve, squarings)) for squarings in (1, SQUARINGS))
+def _solve_eight(left: Float[Array, "8 3 problem"], right, weights: Float[Array, "8 problem"]):
+    rows = (left[:, :, None] * right[:, None]).reshape(8, 9, -1)
+    return null_space(rows * weights[:, None]).reshape(3, 3, -1)
 
 
-def _smallest_eigenvector(m: Float[Array, "9 9 problem"], squarings: int) -> Float[Array, "9 problem"]:
+_exact, _overdetermined = problems_last(_solve_eight), problems_last(_solve)
+
+
+def _smallest_eigenvector(m: Float[Array, "9 9 problem"]) -> Float[Array, "9 problem"]:
     identity = jnp.eye(9, dtype=m.dtype)[:, :, None]
 
     def sweep(k, a):
@@ -70,7 +74,7 @@ def _smallest_eigenvector(m: Float[Array, "9 9 problem"], squarings: int) -> Flo
 
     trace = jnp.maximum(jnp.sum(m * identity, axis=(0, 1), keepdims=True), TINY)
     power = lax.fori_loop(0, 9, sweep, m / trace + SHIFT * identity)
-    power = lax.fori_loop(0, squarings, squared, power / jnp.max(jnp.abs(power), axis=(0, 1), keepdims=True))
+    power = lax.fori_loop(0, SQUARINGS, squared, power / jnp.max(jnp.abs(power), axis=(0, 1), keepdims=True))
     size = jnp.sum(power * power, axis=1)
     longest = size >= jnp.max(size, axis=0, keepdims=True)
     first = longest & (jnp.cumsum(longest, axis=0) == 1)
