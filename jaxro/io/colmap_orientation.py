@@ -39,7 +39,7 @@ from ..results import RESULTS, is_usable
 from ..starts.general import rotation_only
 
 SEARCHED = 256
-EIGHT = Ransac(EightPoint(block=8), count=128, confidence=0.9, limit=5.0)
+EIGHT = Ransac(EightPoint(), count=128, confidence=0.9, limit=5.0)
 FIVE = Ransac(FivePoint(), count=1024, confidence=0.99, limit=5.0)
 """Enough down to a third of right matches."""
 

@@ -108,7 +108,7 @@ def refined(subset: Pair, pose: RelativePose, steps: int) -> tuple[RelativePose,
     zero, one = jnp.zeros_like(left), jnp.ones_like(left)
 
     def condition(turn: Vector, base: Vector, rotation: Matrix, point) -> Array:
-        """g with the right photo turned about its own axes: one gradient of it, where `pose.moved` takes five slopes."""
+        """g with the right photo turned about its own axes: one gradient, where `pose.moved` takes five slopes."""
         x1, y1, x2, y2 = point
         p2 = (x2, y2, -right)
         turned = tuple(a + b for a, b in zip(p2, rot.cross(turn, p2), strict=True))

@@ -1,4 +1,4 @@
-"""Vectors at right angles to a few rows, by Householder reflections (Golub and Van Loan 2013, Matrix Computations, 5.2).
+"""Vectors at right angles to a few rows, by Householder reflections (Golub and Van Loan, Matrix Computations, 5.2).
 
 Arrays carry the problems on their last axis. Nothing is squared, so that nothing of the precision is lost; rows that
 depend on others give more vectors than are returned, of which these are some.
@@ -12,7 +12,7 @@ TINY = 1e-300
 
 
 def null_space(rows: Float[Array, "row column problem"]) -> Float[Array, "rest column problem"]:
-    """As many orthonormal vectors at right angles to the rows as there are columns more: the last of Q in rowsᵀ = Q R."""
+    """Orthonormal vectors at right angles to the rows, as many as columns are more: the last of Q in rowsᵀ = Q R."""
     count, size, _ = rows.shape
     m, reflectors = jnp.swapaxes(rows, 0, 1), []
     for _ in range(count):
