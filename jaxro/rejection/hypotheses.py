@@ -62,7 +62,7 @@ class FivePoint(AbstractHypotheses):
 class EightPoint(AbstractHypotheses):
     """The linear solution of eight points and `steps` Gauss-Newton steps on their conditions: any position.
 
-    A twentieth of the work of `FivePoint`, which outweighs that a subset of eight more often holds a wrong point. Where
+    A fifteenth of the work of `FivePoint`, which outweighs that a subset of eight more often holds a wrong point. Where
     all points lie near a plane it fails.
     """
 
