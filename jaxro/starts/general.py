@@ -21,6 +21,10 @@ from .decomposition import best_pose, cheirality
 from .eight_point import eight_point
 from .five_point import five_point
 
+EXACT = 1e-18
+"""Mean square distance over f² that is rounding. Among such solutions, as five points have them, the first is taken:
+rounding would choose another one in another program."""
+
 BEHIND = 0.25
 """Share of points behind a photo above which a candidate counts as a wrong decomposition."""
 
@@ -51,7 +55,7 @@ class General(AbstractStart):
         freedom = pair.count - 5
         slack = jnp.where(freedom > 0, 10 / jnp.where(freedom > 0, freedom, 1.0), 0.0)
         ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
-        ambiguous = ambiguous & (other < squares * (1 + slack) + 1e-18)
+        ambiguous = ambiguous & (other < squares * (1 + slack) + EXACT)
         turn, parallax = rotation_only(left, right, pair.mask)
         noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
         pure = parallax < significant(freedom) * noise + 1e-9
@@ -101,7 +105,7 @@ def _scores(pair: Pair, poses: RelativePose, left, right) -> Float[Array, " cand
 
     def one(pose):
         wrong = _behind(pose, left, right, pair.mask) > BEHIND
-        score = rms_distance(pair, pose) ** 2 + jnp.where(wrong, 1.0, 0.0)
+        score = jnp.maximum(rms_distance(pair, pose) ** 2, EXACT) + jnp.where(wrong, 1.0, 0.0)
         return jnp.where(jnp.isfinite(score), score, jnp.inf)
 
     return jax.vmap(one)(poses)
