@@ -8,7 +8,7 @@ matrix, cofactors, redundancy, sigma0. Observation equations l = f(x) are the ca
 linear in l are satisfied to first order in v (the second order is |v| over the radius of curvature).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -20,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from . import normal_equations as normal
 from .elements import AbstractElements
 from .losses import AbstractLoss
+from .programs import part
 from .reductions import count
 from .results import RESULTS
 
@@ -126,8 +127,8 @@ def whitened(g: list, d: list, use) -> list:
 class Residuals(eqx.Module):
     """The whitened residuals of all groups as a function of a displacement x of the parameters from `centre`.
 
-    What the groups share is computed once by `prepare(parameters)`; its few numbers θ are what a group's condition
-    sees.
+    What the groups share is computed once by `prepare(parameters)`, of elements `prepare(R, b)`; its few numbers θ are
+    what a group's condition sees.
     """
 
     prepare: Callable | None
@@ -141,7 +142,20 @@ class Residuals(eqx.Module):
     def shared(self, *x: Array) -> PyTree:
         """θ(x): what `prepare` makes of the parameters, or the parameters themselves."""
         parameters = moved(self.centre, x)
-        return parameters if self.prepare is None else jax.tree.map(jnp.asarray, self.prepare(parameters))
+        return self._prepared(*(parameters.relative() if self._of_elements else (parameters,)))
+
+    @property
+    def _of_elements(self) -> bool:
+        return self.prepare is not None and isinstance(self.centre, AbstractElements)
+
+    def _prepared(self, *parameters) -> PyTree:
+        return parameters[0] if self.prepare is None else jax.tree.map(jnp.asarray, self.prepare(*parameters))
+
+    def further(self, x: tuple[Array, ...], step: tuple[Array, ...]) -> tuple[Array, ...]:
+        """The displacement x followed by a step, which has the directions of `columns`."""
+        if self._of_elements:
+            return self.centre.further(x, step)
+        return tuple(a + b for a, b in zip(x, step, strict=True))
 
     def groups(self, function: Callable, theta: PyTree) -> Any:
         """function(g, B Q Bᵀ, use) of every group."""
@@ -156,29 +170,31 @@ class Residuals(eqx.Module):
     def __call__(self, x: tuple[Array, ...]) -> Float[Array, " group"] | Float[Array, "group m"]:
         return together(self.groups(self.residuals, self.shared(*x)))
 
-    def columns(self, x: tuple[Array, ...]) -> tuple[list[Array], list[list[Array]], list[Array] | None]:
-        """The m residual arrays, for each parameter the m arrays of its column, and the weights of both.
+    def columns(self, x: tuple[Array, ...]) -> tuple[list[Array], Sequence[Sequence[Any]], list[Array] | None]:
+        """The m residual arrays, for each direction at x the m arrays of its column, and the weights of both.
 
         A single condition stays unwhitened, residual g and weight 1/d, d = B Q Bᵀ: its column is √d times that of
-        g/√d, that is ∂g - g ∂d / 2d, and no root is taken. A loss enters as the weight rho'(r²): steps are those of
-        iteratively reweighted least squares, which do not overshoot as those of the transformed residual may.
+        g/√d, that is ∂g - g ∂d / 2d, and no root is taken; one gradient by θ gives all columns. A loss enters as the
+        weight rho'(r²): steps are those of iteratively reweighted least squares, which do not overshoot as those of
+        the transformed residual may.
         """
+        if self._of_elements:
+            theta, along = self.centre.slopes(self._prepared, x)
+        else:
+            theta, along = normal.slopes(self.shared, x)
 
-        def entries(g, d, use):
-            return (g, d[0]) if len(g) == 1 else (whitened(g, d, use), [])
+        def one(observation, cofactor, use):
+            at = lambda theta: discrepancy(self.condition, theta, observation, cofactor, use)
+            (g, d), pull = jax.vjp(at, theta)
+            if len(g) > 1:
+                r, push = jax.linearize(lambda theta: whitened(*at(theta), use), theta)
+                return r, [push(slope) for slope in along], None
+            weight = jnp.where(use, 1 / d[0][0], 0.0)
+            (gradient,) = pull(([jnp.ones_like(weight)], [[-0.5 * g[0] * weight]]))
+            return g, [[_dot(gradient, slope, ())] for slope in along], [weight]
 
-        slopes = []
-        for k, at in enumerate(x):  # one parameter at a time: what it does not touch stays a symbolic zero
-            along = lambda t, k=k: self.shared(*x[:k], t, *x[k + 1 :])
-            theta, slope = jax.jvp(along, (at,), (jnp.ones_like(at),))
-            slopes.append(slope)
-        (r, d), push = jax.linearize(lambda theta: self.groups(entries, theta), theta)
-        pushed = [push(slope) for slope in slopes]
-        if not d:
-            return r, [column for column, _ in pushed], reweighted(self.loss, r, None)
-        weight = jnp.where(self.mask, 1 / d[0], 0.0)
-        half = 0.5 * r[0] * weight
-        return r, [[dr[0] - half * dd[0]] for dr, dd in pushed], reweighted(self.loss, r, [weight])
+        r, columns, weight = jax.vmap(one)(self.observations, self.cofactor, self.mask)
+        return r, columns, reweighted(self.loss, r, weight)
 
 
 def reweighted(loss: AbstractLoss | None, r: list[Array], weight: list[Array] | None) -> list[Array] | None:
@@ -219,7 +235,8 @@ def adjust(
     leaves have the groups on the first axis; `cofactor`: its variances (relative to sigma0²), a tree that may end above
     the leaves and then holds for all of them: numbers or one per group, None for what is free of error. `mask` selects
     groups. `start`: elements, or any pytree of numbers.
-    `prepare`: what all groups share, computed once; the condition then gets prepare(parameters) for the parameters.
+    `prepare`: what all groups share, computed once; the condition then gets prepare(parameters) for the parameters, and
+    with elements prepare(R, b) of their `relative`.
     `solver`: any optimistix least-squares solver; `GaussNewton()` if None.
 
     With a loss, normal matrix and redundancy carry the final weights rho'(r²), and sigma0² = Σ w r² / (n - p): the
@@ -235,7 +252,7 @@ def adjust(
     residuals = residuals_of(condition, prepare, start, observations, cofactor, mask, loss)
     p = dimension(start)
     origin = tuple(jnp.zeros((), jax.tree.leaves(start)[0].dtype) for _ in range(p))
-    solution = optx.least_squares(
+    solve = lambda origin, residuals: optx.least_squares(
         lambda x, residuals: residuals(x),
         normal.GaussNewton() if solver is None else solver,
         origin,
@@ -244,6 +261,7 @@ def adjust(
         adjoint=optx.ImplicitAdjoint(linear_solver=normal.SmallCholesky()),
         throw=False,
     )
+    solution = part(solve)(origin, residuals)
     parameters = moved(start, solution.value)
     if isinstance(parameters, AbstractElements):
         parameters = parameters.normalised()
@@ -257,8 +275,9 @@ def adjust(
 def residuals_of(condition, prepare, centre, observations, cofactor, mask, loss=None) -> Residuals:
     """`Residuals` whose functions carry what they close over as arguments, so that it can be differentiated."""
     if prepare is not None:
-        prepare = eqx.filter_closure_convert(prepare, centre)
-        prepared = jax.eval_shape(prepare, centre)
+        parameters = centre.relative() if isinstance(centre, AbstractElements) else (centre,)
+        prepare = eqx.filter_closure_convert(prepare, *parameters)
+        prepared = jax.eval_shape(prepare, *parameters)
     else:
         prepared = centre
     first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), observations)

@@ -34,7 +34,7 @@ ALONE = 1 << 14
 """Points of a batch that are oriented from the vertical before other threads have begun."""
 
 FEW = 32
-"""Points up to which wider vectors gain (3 to 10 %); with more they lose."""
+"""Points up to which wider vectors gain (3 to 10 %) and one kernel for all (20 %); with more the vectors lose."""
 
 
 def _everything(result: Any) -> Any:
@@ -103,7 +103,9 @@ def oriented_near(
     chunk = _chunk(pairs, way.chunk)
     if pairs.x_left.size <= ALONE:
         way = way._replace(threads=way.threads or 1, calls=0)
-    return spread(pairs, Program(_slab_near, options | {"chunk": chunk}, _settings(pairs)), way, chunk, report)
+    few = pairs.x_left.shape[1] <= FEW and options.get("solver") is None
+    program = Program(_slab_near, options | {"chunk": chunk}, _settings(pairs), one_kernel=few)
+    return spread(pairs, program, way, chunk, report)
 
 
 def _replace(out: PyTree, rows: np.ndarray, new: PyTree) -> None:

@@ -39,7 +39,7 @@ def linearised(pair: Pair, pose: RelativePose) -> Linear:
     prepare, condition, observations, cofactor = coplanarity.rigorous(pair)
     residuals = Residuals(prepare, condition, pose, observations, cofactor, pair.mask)
     (g,), jacobian, weight = residuals.columns((jnp.zeros_like(pair.focal_left),) * 5)
-    f = prepare(pose)
+    f = prepare(*pose.relative())
     gradient = jax.vmap(lambda point: jax.grad(condition, argnums=1)(f, point))(pair.coordinates)
     used = lambda a: jnp.where(pair.mask, a, 0.0)
     columns = [used(column) for (column,) in jacobian]

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from . import rotations as rot
-from .elements import AbstractElements, essential_matrix
+from .elements import essential
 from .pairs import Pair
 from .rotations import Matrix, Vector
 
@@ -30,7 +30,7 @@ Point = tuple[Scalar, Scalar, Scalar, Scalar]
 
 
 class Adjusted(NamedTuple):
-    """What `adjust` needs: prepare(elements) once for the pair, condition(prepared, observation) of one point, and the
+    """What `adjust` needs: prepare(R, b) once for the pair, condition(prepared, observation) of one point, and the
     observations and cofactors of all points."""
 
     prepare: Callable
@@ -39,9 +39,9 @@ class Adjusted(NamedTuple):
     cofactor: PyTree
 
 
-def fundamental_matrix(elements: AbstractElements, focal_left: Scalar, focal_right: Scalar) -> Matrix:
+def fundamental_matrix(rotation: Matrix, base: Vector, focal_left: Scalar, focal_right: Scalar) -> Matrix:
     """F = diag(1, 1, -f1) E diag(1, 1, -f2), so that g = (x1, y1, 1) F (x2, y2, 1)ᵀ; once for a pair."""
-    e = essential_matrix(elements)
+    e = essential(rotation, base)
     return (
         (e[0][0], e[0][1], -focal_right * e[0][2]),
         (e[1][0], e[1][1], -focal_right * e[1][2]),
@@ -56,14 +56,13 @@ def condition(f: Matrix, point: Point) -> Scalar:
     return x1 * a + y1 * b + c
 
 
-def turned(elements: AbstractElements) -> tuple[Matrix, Matrix]:
+def turned(rotation: Matrix, base: Vector) -> tuple[Matrix, Matrix]:
     """Rotations of the left and right photo into the frame parallel to the base.
 
     X runs along the base and the left photo is not turned about X: Y = z x X / |z x X| with z the axis of the left
     photo. These are the papers' R_alpha R_chi and R_alpha' R_omega' R_chi', without their angles; undefined only for a
     base along the photo axis.
     """
-    rotation, base = elements.relative()
     across = rot.length(base[0], base[1])
     x = rot.unit(base)
     y = (-base[1] / across, base[0] / across, jnp.zeros_like(across))
@@ -83,15 +82,15 @@ def y_parallax(rows: tuple, point: Point, focal_left: Scalar, focal_right: Scala
 
 def rigorous(pair: Pair) -> Adjusted:
     """Adjust the four image coordinates of every point."""
-    prepare = lambda elements: fundamental_matrix(elements, pair.focal_left, pair.focal_right)
+    prepare = lambda rotation, base: fundamental_matrix(rotation, base, pair.focal_left, pair.focal_right)
     return Adjusted(prepare, condition, pair.coordinates, pair.sigma**2)
 
 
 def parallax(pair: Pair) -> Adjusted:
     """Adjust the y-parallax of every point as if it had been measured; the coordinates are taken as free of error."""
 
-    def prepare(elements: AbstractElements):
-        left, right = turned(elements)
+    def prepare(rotation: Matrix, base: Vector):
+        left, right = turned(rotation, base)
         return left[1:], right[1:], pair.focal_left, pair.focal_right
 
     def of_point(prepared: tuple, observation: tuple[Point, Scalar]) -> Scalar:

@@ -41,7 +41,7 @@ def margin(pair: Pair, elements: AbstractElements, cofactor: Float[Array, "5 5"]
 
     def fundamental(t):
         moved = elements.moved(tuple(t * e for e in direction))
-        return coplanarity.fundamental_matrix(moved, pair.focal_left, pair.focal_right)
+        return coplanarity.fundamental_matrix(*moved.relative(), pair.focal_left, pair.focal_right)
 
     zero = jnp.zeros_like(pair.focal_left)
     f, slope = jax.jvp(fundamental, (zero,), (jnp.ones_like(zero),))

@@ -15,13 +15,16 @@ All fields are scalars (arrays over the pairs in a batch); angles are radians.
 """
 
 import abc
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import rotations as rot
+from .normal_equations import slopes
 from .rotations import Matrix, Vector
 
 Scalar = Float[Array, "..."]
@@ -54,6 +57,14 @@ class AbstractElements(eqx.Module):
     @abc.abstractmethod
     def values(self) -> tuple[Scalar, ...]:
         """The five element values in the order of `names`; for RelativePose the local parameters, all zero."""
+
+    def slopes(self, function: Callable, x: Step) -> tuple[Any, list[Any]]:
+        """function(R, b) of the elements moved by x, and its derivatives along five directions from there."""
+        return slopes(lambda *x: function(*self.moved(x).relative()), x)
+
+    def further(self, x: Step, step: Step) -> Step:
+        """The displacement x followed by a step along the directions of `slopes`."""
+        return tuple(a + b for a, b in zip(x, step, strict=True))
 
     @classmethod
     @abc.abstractmethod
@@ -110,6 +121,35 @@ class RelativePose(AbstractElements):
             z + w * c + x * b - y * a,
             *(along * p + u * q + v * r for p, q, r in zip(base, first, second, strict=True)),
         )
+
+    def slopes(self, function: Callable, x: Step) -> tuple[Any, list[Any]]:
+        """The right photo turns about its own axes: R [e_k]x is R with two columns exchanged, one of them negative.
+        The base moves by its stereographic coordinates."""
+        rotation, base = self.moved(x).relative()
+        columns = rot.transpose(rotation)
+        along = []
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+
+            def turned(*pair, k=k, i=i, j=j):
+                ordered = {k: columns[k], i: pair[0], j: pair[1]}
+                return function(rot.transpose((ordered[0], ordered[1], ordered[2])), base)
+
+            back = tuple(-entry for entry in columns[i])
+            along.append(jax.jvp(turned, (columns[i], columns[j]), (columns[j], back))[1])
+        first = self.bx, self.by, self.bz
+        for tangent, t in zip(rot.tangents(first), x[3:], strict=True):
+            direction = tuple(q - t / 2 * p for p, q in zip(first, tangent, strict=True))
+            value, slope = jax.jvp(lambda base: function(rotation, base), (base,), (direction,))
+            along.append(slope)
+        return value, along
+
+    def further(self, x: Step, step: Step) -> Step:
+        """Of two rotations with halved parameters a and then e those of both are (a + e + a x e) / (1 - a . e)."""
+        a, e = ((s[0] / 2, s[1] / 2, s[2] / 2) for s in (x, step))
+        twice = 2 / (1 - rot.dot(a, e))
+        turn = (twice * (p + q + r) for p, q, r in zip(a, e, rot.cross(a, e), strict=True))
+        return *turn, x[3] + step[3], x[4] + step[4]
 
     def normalised(self) -> "RelativePose":
         """The same pose with quaternion and base of unit length, qw >= 0."""
@@ -223,6 +263,10 @@ def convert(pose: RelativePose, system: type[AbstractElements], length: Scalar) 
 
 
 def essential_matrix(elements: AbstractElements) -> Matrix:
-    """E with p1ᵀ E p2 = b . (p1 x R p2) = 0; column c is (column c of R) x b."""
-    rotation, base = elements.relative()
+    """E with p1ᵀ E p2 = b . (p1 x R p2) = 0."""
+    return essential(*elements.relative())
+
+
+def essential(rotation: Matrix, base: Vector) -> Matrix:
+    """E of R and b; column c is (column c of R) x b."""
     return rot.transpose(tuple(rot.cross(column, base) for column in rot.transpose(rotation)))  # pyright: ignore

@@ -120,7 +120,7 @@ def _on_m_q(pair: Pair, orientation: Orientation, linear: Linear, shift: list[Va
 
     With q = c g every parallax changes by c (a · shift), that of the point itself by c jump more.
     """
-    left, right = (frame[2] for frame in coplanarity.turned(orientation.pose))
+    left, right = (frame[2] for frame in coplanarity.turned(*orientation.pose.relative()))
 
     def ratio(point):
         """c = -f / (Z1 Z2) of the photos turned parallel to the base."""

@@ -173,7 +173,7 @@ def detectable_errors(pair: Pair, adjustment: Adjustment, delta0: ArrayLike = DE
 
     r the redundancy number of its condition. Where nothing checks a coordinate it is no infinity but 1e8 delta0 sigma.
     """
-    f = coplanarity.fundamental_matrix(adjustment.parameters, pair.focal_left, pair.focal_right)
+    f = coplanarity.fundamental_matrix(*adjustment.parameters.relative(), pair.focal_left, pair.focal_right)
 
     def one(point, sigma, r):
         b = jax.grad(coplanarity.condition, argnums=1)(f, point)
@@ -198,7 +198,7 @@ def height_deviations(adjustment: Adjustment, points: Pair, base: ArrayLike) -> 
     def height(step, point):
         moved = found.moved(step)
         (rotation, along), frame = moved.relative(), moved.model_frame()
-        f = coplanarity.fundamental_matrix(moved, *focals)
+        f = coplanarity.fundamental_matrix(*moved.relative(), *focals)
         v = coplanarity.corrections(f, point, jnp.asarray(True))
         corrected = tuple(c + d for c, d in zip(point, v, strict=True))
         right, along = rot.product(frame, rotation), rot.scaled(rot.apply(frame, along), length)

@@ -17,7 +17,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .programs import stage
+from .programs import part, stage
 from .reductions import sums
 
 Scalar = Float[Array, ""]
@@ -53,6 +53,16 @@ def columns(residual: Callable, x: Scalars) -> tuple[Columns, list[Columns], Non
     r, push = jax.linearize(lambda *y: residual(y), *x)
     unit = jnp.eye(len(x), dtype=r.dtype)
     return [r], [[push(*(unit[k, i] for i in range(len(x))))] for k in range(len(x))], None
+
+
+def slopes(function: Callable, x: Scalars) -> tuple[Any, list[Any]]:
+    """function(*x) and its derivatives by x_k, one after the other: what a parameter does not touch stays a symbolic
+    zero."""
+    value, derivatives = None, []
+    for k, at in enumerate(x):
+        value, slope = jax.jvp(lambda t, k=k: function(*x[:k], t, *x[k + 1 :]), (at,), (jnp.ones_like(at),))
+        derivatives.append(slope)
+    return value, derivatives
 
 
 def cholesky(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
@@ -125,10 +135,10 @@ def inverse(n: Lower) -> tuple[Lower, Scalar]:
 class GaussNewton(optx.AbstractLeastSquaresSolver):
     """Gauss-Newton for a few parameters; its loop carries the parameters and two step sizes, nothing else.
 
-    `args` that know their own residuals and columns (`adjustment.Residuals`) are asked for them; any other residual
-    function is linearised. Ends when the *next* step, predicted from the last two, is below atol + rtol |x|.
-    `max_step` bounds the largest component of a step (0.5 rad for orientations, where a longer one leaves the range of
-    the linearisation).
+    `args` that know their own residuals and columns, and how a step follows others (`adjustment.Residuals`), are asked
+    for them; any other residual function is linearised. Ends when the *next* step, predicted from the last two, is
+    below atol + rtol |x|. `max_step` bounds the largest component of a step (0.5 rad for orientations, where a longer
+    one leaves the range of the linearisation).
     """
 
     rtol: float = 1e-10
@@ -142,7 +152,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
 
     def step(self, fn, y, args, options, state, tags):
         leaves, structure = jax.tree.flatten(y)
-        if hasattr(args, "columns"):
+        known = hasattr(args, "columns")
+        if known:
             r, jacobian, weight = args.columns(tuple(leaves))
         else:
             r, jacobian, weight = columns(
@@ -154,7 +165,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
         for d in delta:
             longest = jnp.maximum(longest, jnp.abs(d))
         shrink = jnp.minimum(1.0, self.max_step / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny))
-        moved = [x - shrink * d for x, d in zip(leaves, delta, strict=True)]
+        taken = tuple(-shrink * d for d in delta)
+        moved = args.further(tuple(leaves), taken) if known else [x + d for x, d in zip(leaves, taken, strict=True)]
         largest = longest * 0
         for x in moved:
             largest = jnp.maximum(largest, jnp.abs(x))
@@ -201,4 +213,4 @@ def steps(residuals: Any, x: tuple[Scalar, ...], count: int, max_step: float) ->
     def body(_, x):
         return solver.step(lambda x, residuals: (residuals(x), None), x, residuals, {}, (x[0], x[0]), frozenset())[0]
 
-    return lax.fori_loop(0, count, body, x)
+    return part(lambda x: lax.fori_loop(0, count, body, x))(x)

@@ -165,7 +165,7 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     length = _length(pair, elements, base, pose)
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
-    frames = tuple(frame[1:] for frame in coplanarity.turned(pose))
+    frames = tuple(frame[1:] for frame in coplanarity.turned(*pose.relative()))
     q_of = lambda point, use: jnp.where(
         use, coplanarity.y_parallax(frames, point, pair.focal_left, pair.focal_right), 0.0
     )
@@ -223,7 +223,7 @@ def _corrections_of(poses_and_pairs: tuple[RelativePose, Pair]) -> Coordinates:
 
 
 def _corrections(pose: RelativePose, pair: Pair) -> Coordinates:
-    f = coplanarity.fundamental_matrix(pose, pair.focal_left, pair.focal_right)
+    f = coplanarity.fundamental_matrix(*pose.relative(), pair.focal_left, pair.focal_right)
     return jax.vmap(lambda point, use: coplanarity.corrections(f, point, use))(pair.coordinates, pair.mask)
 
 

@@ -32,6 +32,9 @@ WIDE = {"xla_cpu_prefer_vector_width": 512}
 QUICK = {**FAST, "xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 """For single pairs: the older code generator at a lower level compiles in half the time, and runs no slower there."""
 
+ONE_KERNEL = {"xla_cpu_experimental_ynn_fusion_type": ""}
+"""No sums by a library, which cannot be called from within a kernel."""
+
 
 class _Key:
     """Static options, compared by value."""
@@ -49,30 +52,54 @@ class _Key:
 
 
 class Program:
-    """data -> function(data, **options), compiled; arrays among the options are passed along as arguments."""
+    """data -> function(data, **options), compiled; arrays among the options are passed along as arguments.
 
-    def __init__(self, function: Callable, options: dict[str, Any], settings: dict[str, Any] = FAST):
+    `one_kernel`: for arrays of a few thousand numbers, where the compiler can.
+    """
+
+    def __init__(
+        self, function: Callable, options: dict[str, Any], settings: dict[str, Any] = FAST, *, one_kernel: bool = False
+    ):
         self._settings = tuple(settings.items())
         self._arrays, static = eqx.partition(options, eqx.is_array)
         self._static = _Key(static)
         self._function = function
+        self._one_kernel = one_kernel
 
     def __call__(self, data: PyTree) -> PyTree:
-        key = self._function, self._static, self._settings
+        settings = *self._settings, *ONE_KERNEL.items()
+        if self._one_kernel and not self.refused and _settings(settings):
+            try:
+                return self._run(data, kernel(self._function), settings)
+            except jax.errors.JaxRuntimeError:  # sorting, say, in what a caller selects
+                self._beside["refused"] = True
+        return self._run(data, self._function, self._settings)
+
+    @property
+    def refused(self) -> bool:
+        """Whether the compiler could not make one kernel of it."""
+        return "refused" in self._beside
+
+    @property
+    def _beside(self) -> dict[str, Any]:
+        return _beside(self._function, self._static, self._settings)
+
+    def _run(self, data: PyTree, function: Callable, settings: tuple) -> PyTree:
+        key = self._function, self._static, settings
         arguments = data, self._arrays
         if program_store.active():
             shapes = tuple((np.shape(a), str(a.dtype)) for a in jax.tree.leaves(arguments))
             stored = _beside(*key).setdefault("stored", {})
             if shapes not in stored:
-                function, settings = _flat(self._function, self._static), _settings(self._settings)
-                stored[shapes] = program_store.compiled(function, settings, arguments, key)
+                flat = _flat(function, self._static)
+                stored[shapes] = program_store.compiled(flat, _settings(settings), arguments, key)
             return stored[shapes](arguments)
-        return _compiled(*key)(*arguments)
+        return _compiled(function, *key[1:])(*arguments)
 
     @property
     def outputs(self) -> dict[Any, PyTree]:
         """Room for a caller to keep the shapes of its results, as long as the compiled program lives."""
-        return _beside(self._function, self._static, self._settings).setdefault("outputs", {})
+        return self._beside.setdefault("outputs", {})
 
 
 def _flat(function: Callable, static: _Key) -> Callable:
@@ -89,7 +116,7 @@ def _compiled(function: Callable, static: _Key, settings: tuple) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def _beside(function: Callable, static: _Key, settings: tuple) -> dict[str, dict]:
+def _beside(function: Callable, static: _Key, settings: tuple) -> dict[str, Any]:
     """What is remembered of a program."""
     return {}
 
@@ -110,12 +137,46 @@ def stage(function: Callable) -> Callable:
     XLA's CPU backend fuses a small computation into every consumer and repeats it there (an `optimization_barrier` is
     gone before it does). Other backends see the plain function.
     """
-    if jax.default_backend() != "cpu":
-        return function
-    compiled = jax.jit(lambda *arguments: function(*arguments))
+    return _call(function, inlineable="false") if jax.default_backend() == "cpu" else function
+
+
+_within_kernel = jax.make_user_context(False)
+
+
+@lru_cache(maxsize=64)
+def kernel(function: Callable) -> Callable:
+    """The function as one compiled function of the processor.
+
+    XLA's CPU backend compiles a program as many small ones and goes from one to the next at run time, which here costs
+    as much as a fifth of the work. Not for arrays so long that it would spread them over threads.
+    """
+
+    def whole(data: PyTree, **options: Any) -> PyTree:
+        with _within_kernel(True):
+            return _call(lambda data: function(data, **options), **_AS_ONE)(data)
+
+    return whole
+
+
+def part(function: Callable) -> Callable:
+    """Within a kernel a function of its own, which the compiler makes better than a piece of a large one."""
+    return _call(function, **_AS_ONE) if _within_kernel.value else function
+
+
+_AS_ONE = {"inlineable": "false", "xla_cpu_small_call": "true"}
+
+
+def _call(function: Callable, **marks: str) -> Callable:
+    """The function as a call with these marks, not its contents."""
+
+    def unmarked(*arguments):
+        with set_xla_metadata(inlineable="true", xla_cpu_small_call="false"):
+            return function(*arguments)
+
+    compiled = eqx.filter_jit(unmarked)
 
     def call(*arguments):
-        with set_xla_metadata(inlineable="false"):
+        with set_xla_metadata(**marks):
             return compiled(*arguments)
 
     return call

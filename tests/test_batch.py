@@ -13,7 +13,8 @@ import problems
 import pytest
 
 import jaxro
-from jaxro import DependentElements, simulation
+from jaxro import DependentElements, batch, simulation, starts
+from jaxro.programs import FAST, Program
 
 
 def mixed(count=150, points=9):
@@ -60,6 +61,25 @@ def test_only_what_is_selected_and_progress(pairs):
     np.testing.assert_allclose(pose.base, whole.pose.base, atol=1e-9)
     assert [total for _, total in told] == [150] * len(told)
     assert [done for done, _ in told] == sorted(done for done, _ in told) and told[-1][0] == 150
+
+
+def test_one_kernel_gives_what_many_give(pairs):
+    options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
+    few = jax.tree.map(lambda a: a[:96], pairs)
+    programs = [Program(batch._slab_near, options, FAST, one_kernel=one) for one in (True, False)]
+    (one, fits), (many, again) = (jax.tree.map(np.asarray, program(few)) for program in programs)
+    assert not programs[0].refused
+    np.testing.assert_array_equal(fits, again)
+    np.testing.assert_array_equal(one.iterations[fits], many.iterations[fits])
+    for a, b in zip(
+        jax.tree.leaves((one.pose, one.deviations)), jax.tree.leaves((many.pose, many.deviations)), strict=True
+    ):
+        np.testing.assert_allclose(a[fits], b[fits], rtol=1e-9, atol=1e-12)
+
+
+def test_what_no_kernel_can_do_is_done_all_the_same(pairs):
+    ranked = jaxro.orient_batch(pairs, select=lambda o: jnp.sort(o.residuals))
+    np.testing.assert_allclose(ranked, np.sort(jaxro.orient_batch(pairs, select=lambda o: o.residuals)), atol=1e-9)
 
 
 def test_no_lapack_in_the_batch_path(pairs):

@@ -316,3 +316,25 @@ def test_vertical_start_is_enough_for_vertical_photos():
     zero = IndependentElements(*(jnp.zeros(()),) * 5)
     one, two = oriented(measured, IndependentElements), oriented(measured, IndependentElements, start=zero)
     np.testing.assert_allclose(numbers(two.elements), numbers(one.elements), atol=1e-9)
+
+
+@every_system
+def test_slopes_are_derivatives_along_further_steps(system):
+    """Of R and b without their scale, which an unnormalised pose leaves open."""
+    key = jax.random.split(jax.random.key(5), 3)
+    pose = jaxro.to_pose(IndependentElements(*(0.4 * jax.random.normal(key[0], (5,)))))
+    centre = convert(pose, system, jnp.asarray(BASE))
+    x = tuple(0.3 * jax.random.normal(key[1], (5,)))
+
+    def directions(rotation, base):
+        size = rotations.length(rotation[0][0], rotations.length(rotation[1][0], rotation[2][0]))
+        return jnp.stack([entry / size for row in rotation for entry in row] + list(rotations.unit(base)))
+
+    def after(*step):
+        return directions(*centre.moved(centre.further(x, step)).relative())
+
+    value, slopes = centre.slopes(directions, x)
+    np.testing.assert_allclose(value, after(*jnp.zeros(5)), atol=1e-14)
+    np.testing.assert_allclose(
+        jnp.stack(slopes), jnp.stack(jax.jacfwd(after, argnums=tuple(range(5)))(*jnp.zeros(5))), atol=1e-13
+    )

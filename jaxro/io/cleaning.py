@@ -105,7 +105,7 @@ def clean_all(
 def _parallaxes(pair_and_pose: tuple[Pair, AbstractElements]) -> Float[Array, "point"]:
     """q of all points of a pair at its orientation, whether they took part in it or not."""
     pair, pose = pair_and_pose
-    rows = tuple(frame[1:] for frame in coplanarity.turned(pose))
+    rows = tuple(frame[1:] for frame in coplanarity.turned(*pose.relative()))
     return jax.vmap(lambda point: coplanarity.y_parallax(rows, point, pair.focal_left, pair.focal_right))(
         pair.coordinates
     )

@@ -78,7 +78,7 @@ class Recorder(NamedTuple):
 
     def _parallaxes(self, pair: Pair, o: Orientation) -> Array:
         """q of all points, whether they took part or not."""
-        rows = tuple(frame[1:] for frame in coplanarity.turned(o.pose))
+        rows = tuple(frame[1:] for frame in coplanarity.turned(*o.pose.relative()))
         q = lambda point: coplanarity.y_parallax(rows, point, pair.focal_left, pair.focal_right)
         return jax.vmap(q)(pair.coordinates)
 
