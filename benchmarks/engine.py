@@ -16,7 +16,7 @@ import numpy as np
 import jaxro
 from jaxro import coplanarity, starts
 from jaxro.orientation import orient_near
-from jaxro.programs import QUICK as QUICK_PROGRAM
+from jaxro.programs import QUICK, loops
 
 from . import peers
 from .common import Size, agreement, pair_of, pose, poses, rate, ratio, ready, share
@@ -124,8 +124,8 @@ def latency(size: Size) -> list[Metric]:
     near = partial(orient_near, start=starts.Auto(steps=0))
     orient = jax.jit(jaxro.orient)
     calls: dict[str, Callable] = {
-        "compiled function, pose": jax.jit(lambda pair: near(pair)[0].pose, compiler_options=QUICK_PROGRAM),
-        "compiled function, whole Orientation": jax.jit(near, compiler_options=QUICK_PROGRAM),
+        "compiled function, pose": jax.jit(loops(lambda pair: near(pair)[0].pose), compiler_options=QUICK),
+        "compiled function, whole Orientation": jax.jit(loops(near), compiler_options=QUICK),
         "orient(pair)": jaxro.orient,
         "jit(orient)(pair)": orient,
     }

@@ -16,7 +16,7 @@ from jaxtyping import Array, PyTree
 
 from .orientation import Orientation, orient, orient_near
 from .pairs import Pair
-from .programs import FAST, WIDE, Program
+from .programs import FAST, WIDE, Program, whole
 from .rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
 from .slabs import Report, Way, spread, unheard
 from .starts import AbstractStart, Auto
@@ -103,8 +103,8 @@ def oriented_near(
     chunk = _chunk(pairs, way.chunk)
     if pairs.x_left.size <= ALONE:
         way = way._replace(threads=way.threads or 1, calls=0)
-    few = pairs.x_left.shape[1] <= FEW and options.get("solver") is None
-    program = Program(_slab_near, options | {"chunk": chunk}, _settings(pairs), one_kernel=few)
+    kernel = whole if pairs.x_left.shape[1] <= FEW and options.get("solver") is None else None
+    program = Program(_slab_near, options | {"chunk": chunk}, _settings(pairs), kernel=kernel)
     return spread(pairs, program, way, chunk, report)
 
 

@@ -16,7 +16,7 @@ from .elements import AbstractElements, DependentElements, IndependentElements, 
 from .losses import AbstractLoss
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned
-from .programs import FAST, QUICK, Program, traced
+from .programs import FAST, QUICK, Program, loops, traced
 from .reductions import count, sums, total
 from .results import RESULTS, is_usable
 
@@ -113,7 +113,8 @@ def orient(
     options = dict(elements=elements, base=base, residual=residual, loss=loss, solver=solver, max_steps=max_steps)
     if traced((pair, base, start)):
         return _orient(pair, start=start, **options)
-    run = lambda function, start: Program(function, options | {"start": start}, QUICK)(pair)
+    kernel = loops if solver is None else None
+    run = lambda function, start: Program(function, options | {"start": start}, QUICK, kernel=kernel)(pair)
     if not isinstance(start, starts.Auto):
         return run(_orient, start)
     # Two small programs instead of one large: the general start is compiled when a pair first needs it. One pair alone

@@ -33,7 +33,7 @@ QUICK = {**FAST, "xla_cpu_use_fusion_emitters": False, "xla_backend_optimization
 """For single pairs: the older code generator at a lower level compiles in half the time, and runs no slower there."""
 
 ONE_KERNEL = {"xla_cpu_experimental_ynn_fusion_type": ""}
-"""No sums by a library, which cannot be called from within a kernel."""
+"""No sums by a library, which a kernel cannot call."""
 
 
 class _Key:
@@ -54,23 +54,28 @@ class _Key:
 class Program:
     """data -> function(data, **options), compiled; arrays among the options are passed along as arguments.
 
-    `one_kernel`: for arrays of a few thousand numbers, where the compiler can.
+    `kernel`: `whole` or `loops`, for arrays of a few thousand numbers, where the compiler can make one of them.
     """
 
     def __init__(
-        self, function: Callable, options: dict[str, Any], settings: dict[str, Any] = FAST, *, one_kernel: bool = False
+        self,
+        function: Callable,
+        options: dict[str, Any],
+        settings: dict[str, Any] = FAST,
+        *,
+        kernel: Callable[[Callable], Callable] | None = None,
     ):
         self._settings = tuple(settings.items())
         self._arrays, static = eqx.partition(options, eqx.is_array)
         self._static = _Key(static)
         self._function = function
-        self._one_kernel = one_kernel
+        self._kernel = kernel
 
     def __call__(self, data: PyTree) -> PyTree:
         settings = *self._settings, *ONE_KERNEL.items()
-        if self._one_kernel and not self.refused and _settings(settings):
+        if self._kernel is not None and not self.refused and _settings(settings):
             try:
-                return self._run(data, kernel(self._function), settings)
+                return self._run(data, self._kernel(self._function), settings)
             except jax.errors.JaxRuntimeError:  # sorting, say, in what a caller selects
                 self._beside["refused"] = True
         return self._run(data, self._function, self._settings)
@@ -140,27 +145,33 @@ def stage(function: Callable) -> Callable:
     return _call(function, inlineable="false") if jax.default_backend() == "cpu" else function
 
 
-_within_kernel = jax.make_user_context(False)
+_kernels = jax.make_user_context(False)
 
 
 @lru_cache(maxsize=64)
-def kernel(function: Callable) -> Callable:
+def whole(function: Callable) -> Callable:
     """The function as one compiled function of the processor.
 
     XLA's CPU backend compiles a program as many small ones and goes from one to the next at run time, which here costs
     as much as a fifth of the work. Not for arrays so long that it would spread them over threads.
     """
+    return loops(lambda data, **options: _call(lambda data: function(data, **options), **_AS_ONE)(data))
 
-    def whole(data: PyTree, **options: Any) -> PyTree:
-        with _within_kernel(True):
-            return _call(lambda data: function(data, **options), **_AS_ONE)(data)
 
-    return whole
+@lru_cache(maxsize=64)
+def loops(function: Callable) -> Callable:
+    """The function with every `part` of it as one compiled function of the processor; compiles sooner than `whole`."""
+
+    def within(data: PyTree, **options: Any) -> PyTree:
+        with _kernels(True):
+            return function(data, **options)
+
+    return within
 
 
 def part(function: Callable) -> Callable:
-    """Within a kernel a function of its own, which the compiler makes better than a piece of a large one."""
-    return _call(function, **_AS_ONE) if _within_kernel.value else function
+    """Where kernels are made a kernel of its own, which the compiler makes better than a piece of a large one."""
+    return _call(function, **_AS_ONE) if _kernels.value else function
 
 
 _AS_ONE = {"inlineable": "false", "xla_cpu_small_call": "true"}

@@ -14,7 +14,7 @@ import pytest
 
 import jaxro
 from jaxro import DependentElements, batch, simulation, starts
-from jaxro.programs import FAST, Program
+from jaxro.programs import FAST, Program, whole
 
 
 def mixed(count=150, points=9):
@@ -66,7 +66,7 @@ def test_only_what_is_selected_and_progress(pairs):
 def test_one_kernel_gives_what_many_give(pairs):
     options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
     few = jax.tree.map(lambda a: a[:96], pairs)
-    programs = [Program(batch._slab_near, options, FAST, one_kernel=one) for one in (True, False)]
+    programs = [Program(batch._slab_near, options, FAST, kernel=kernel) for kernel in (whole, None)]
     (one, fits), (many, again) = (jax.tree.map(np.asarray, program(few)) for program in programs)
     assert not programs[0].refused
     np.testing.assert_array_equal(fits, again)
