@@ -144,11 +144,10 @@ def orient_near(
 
 def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_steps) -> Orientation:
     pair, bad_input = cleaned(pair)
-    # The optimum does not depend on where it is sought, so no derivative passes through the start.
     if isinstance(start, AbstractElements):
         begin = starts.Begin(start, jnp.asarray(False), jnp.asarray(False))
     else:
-        begin = start(lax.stop_gradient(pair))
+        begin = start(lax.stop_gradient(pair))  # the optimum does not depend on where it is sought
     prepare, condition, observations, cofactor = residual(pair)
     adjustment = adjust(
         condition,
