@@ -39,19 +39,27 @@ def standardised(points, focal, sigma, share, elements):
     """|r| over its standard deviation sqrt(1 + (1 - 2p) h), h = a N⁻¹ a'."""
     r, a = linearised(points, focal, sigma, elements)
     h = np.sum((a @ np.linalg.inv((a.T * share) @ a)) * a, axis=1)
-    return np.abs(r) / np.sqrt(1 + (1 - 2 * share) * h), h
+    return np.abs(r) / np.sqrt(np.maximum(1 + (1 - 2 * share) * h, 1e-12)), h
 
 
-def reweighted(points, focal, sigma, weight, limit, rounds=200):
-    """The points with |w| <= limit at the fixed point of w -> weight(w) next to least squares."""
+def reweighted(points, focal, sigma, weight, limit, rounds=200, convex=5, full=15):
+    """The points with |w| <= limit at the fixed point of w -> weight(w) next to that of Huber's weights, and whether it
+    rests; after `full` rounds the mean of new and last weights. A solution that runs away does not rest."""
     share = np.ones(points.shape[1])
     elements = solved(points, focal, sigma, share, np.zeros(5))
-    for _ in range(rounds):
-        share = weight(standardised(points, focal, sigma, share, elements)[0])
-        before, elements = elements, solved(points, focal, sigma, share, elements, 1)
-        if np.max(np.abs(elements - before)) < 1e-9:
-            break
-    return standardised(points, focal, sigma, share, elements)[0] <= limit
+    try:
+        for k in range(rounds):
+            w = standardised(points, focal, sigma, share, elements)[0]
+            new = np.minimum(1, 1.345 / np.maximum(w, 1e-9)) if k < convex else weight(w)
+            share = new if k < convex + full else (share + new) / 2
+            before, elements = elements, solved(points, focal, sigma, share, elements, 1)
+            if np.max(np.abs(elements)) > 1:
+                break
+            if k >= convex and np.max(np.abs(elements - before)) < 1e-9:
+                return standardised(points, focal, sigma, share, elements)[0] <= limit, True
+    except np.linalg.LinAlgError:
+        pass
+    return np.zeros(points.shape[1], bool), False
 
 
 def snooping(points, focal, sigma, level, estimated=False, least=6):

@@ -11,7 +11,7 @@ from workload import FOCAL as AERIAL_FOCAL, aerial
 
 import jaxro
 from jaxro import losses, simulation
-from jaxro.rejection import AllSubsets, DataSnooping, LeastMedian, Ransac, Reweighting
+from jaxro.rejection import OUTCOMES, AllSubsets, DataSnooping, LeastMedian, Ransac, Reweighting
 from jaxro.rejection.hypotheses import Newton, subsets
 from jaxro.rejection.least_median import upper_median
 
@@ -70,12 +70,22 @@ OFTEN = losses.Huber, losses.IggThree
     ids=lambda function: type(function).__name__,
 )
 def test_reweighting_ends_where_numpy_does(function, count):
-    """Both at a fixed point; where two are near each other rounding may choose."""
+    """Both at the same fixed point, or both told that there is none; of two near each other rounding may choose."""
     measured, wrong = contaminated(count)
-    mask, _ = decided(Reweighting(function, rounds=200, tolerance=1e-10), measured)
-    expected = [judge.reweighted(p, FOCAL, SIGMA, WEIGHTS[function], 3.29) for p in measured.swapaxes(0, 1)]
-    assert differing(mask, expected) <= 0.02
+    procedure = Reweighting(function, rounds=200, tolerance=1e-10)
+    mask, rests = decided(procedure, measured, lambda found: (found.mask, found.outcome == OUTCOMES.finished))
+    judged = [judge.reweighted(p, FOCAL, SIGMA, WEIGHTS[function], 3.29) for p in measured.swapaxes(0, 1)]
+    expected, settled = (np.array(part) for part in zip(*judged, strict=True))
+    assert np.mean(rests == settled) >= 0.98 and np.mean(rests) > 0.95
+    assert differing(mask[rests & settled], expected[rests & settled]) <= 0.02
     assert np.mean(mask == ~wrong) > 0.95
+
+
+def test_reweighting_that_does_not_rest_is_told():
+    measured, _ = contaminated(100)
+    few = decided(Reweighting(rounds=8), measured, lambda found: found.outcome == OUTCOMES.did_not_rest)
+    enough = decided(Reweighting(), measured, lambda found: found.outcome == OUTCOMES.did_not_rest)
+    assert np.mean(few) > 0.2 and not np.any(enough)
 
 
 @pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.slow)])

@@ -35,6 +35,10 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "No orientation was found that so many points agree with that it cannot be an accident. Measure more points, "
         "or give the standard deviation of the coordinates."
     )
+    did_not_rest = (
+        "The weights did not come to rest, so that the points rejected depend on the number of rounds. Use another "
+        "weight function, or the procedure `recommended`."
+    )
     not_oriented = "The points that were kept do not orient the pair; see the result of its orientation."
 
 
@@ -69,6 +73,11 @@ class Rejection(eqx.Module):
     log: Log
     orientation: Orientation
     outcome: OUTCOMES
+
+    def only_if(self, fine: Bool[Array, ""], otherwise: OUTCOMES) -> "Rejection":
+        """The same decision, with another outcome where it is not fine."""
+        outcome = OUTCOMES.where(fine, self.outcome, otherwise)
+        return Rejection(self.mask, self.order, self.statistic, self.log, self.orientation, outcome)
 
 
 class AbstractProcedure(eqx.Module):

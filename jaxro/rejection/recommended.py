@@ -73,15 +73,7 @@ class Recommended(AbstractProcedure):
             pose, use, expected = self._elsewhere(search, fixed, limit, pose, use, expected, needed)
         least = self.share if len(self.searches) == 1 else 0.0
         convinced = (expected <= math.log(self.accidents[-1])) & (count(use) >= least * count(fixed.mask))
-        verdict = judged(pair, pose, use, limit)
-        return Rejection(
-            verdict.mask,
-            verdict.order,
-            verdict.statistic,
-            verdict.log,
-            verdict.orientation,
-            OUTCOMES.where(convinced, verdict.outcome, OUTCOMES.no_consensus),
-        )
+        return judged(pair, pose, use, limit).only_if(convinced, OUTCOMES.no_consensus)
 
     def stages(self) -> list["Recommended"]:
         """The searches as procedures of their own, for batches: each for the pairs that the one before left open."""

@@ -3,33 +3,39 @@
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..conditions import linearised
 from ..elements import RelativePose
-from ..losses import AbstractWeight, Tukey
+from ..losses import AbstractWeight, Huber, Tukey
 from ..pairs import Pair, cleaned
 from ..starts import AbstractStart, Vertical
-from .base import Rejection
+from .base import OUTCOMES, Rejection
 from .robust import AbstractSearch, Values, judged, normalised, scaled, stepped
 
-PLAIN = 2
-"""Steps of least squares before the first reweighted one."""
+PLAIN, CONVEX, FULL = 2, 5, 15
+"""Steps of least squares, steps with Huber's weights, steps with those of the function itself; what follows uses the
+mean of new and last weights.
+
+A function that lets go of a point has many local optima, and large errors spoil that next to least squares: of 1,000
+pairs of 16 points with up to three errors of 4 to 1,000 sigma Tukey's function alone cleans 57 % perfectly, after
+Huber's 87 %. It can also take a point up and let it go for ever: 10 % of these pairs, with the means none.
+"""
 
 
 class Reweighting(AbstractSearch):
     """Least squares with the weights `function`(w²), w the standardised residuals, until the pose rests; |w| > `limit`
     goes.
 
-    Standardised, not plain residuals are weighed, since a point of large leverage draws the solution to itself. A
-    solution of least squares comes first, so that with the functions that let go of a point (all but Huber's and
-    least absolute residuals) it is the local optimum next to that. Ends after `rounds`, or when no local parameter
-    moves by more than `tolerance` (rad). `limit`: root of the chi-squared value of one degree of freedom at .001.
+    Standardised, not plain residuals are weighed, since a point of large leverage draws the solution to itself. Least
+    squares and a few steps with Huber's weights come first, since a function that lets go of a point needs a start
+    that is robust already. Ends when no local parameter moves by more than `tolerance` (rad), or after `rounds`:
+    outcome `did_not_rest`. `limit`: root of the chi-squared value of one degree of freedom at .001.
     """
 
     function: AbstractWeight = Tukey()
     limit: float = 3.29
-    rounds: int = 50
+    rounds: int = 100
     tolerance: float = 1e-7
     sigma: float | None = None
     start: AbstractStart = Vertical()
@@ -37,33 +43,35 @@ class Reweighting(AbstractSearch):
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
-        pose, share = self._solved(fixed)
+        rests, pose, share = self._solved(fixed)
         use = pair.mask & (normalised(linearised(fixed, pose), share) <= self.limit)
-        return judged(pair, pose, use, self.limit)
+        return judged(pair, pose, use, self.limit).only_if(rests, OUTCOMES.did_not_rest)
 
     def search(self, pair: Pair) -> RelativePose:
-        return self._solved(pair)[0]
+        return self._solved(pair)[1]
 
-    def _solved(self, pair: Pair) -> tuple[RelativePose, Values]:
-        """The pose and the factors of the weights at it."""
+    def _solved(self, pair: Pair) -> tuple[Bool[Array, ""], RelativePose, Values]:
+        """Whether it rests, the pose, and the factors of the weights at it."""
         zero = jnp.zeros_like(pair.focal_left)
 
         def more(state):
             rounds, moved, *_ = state
-            return (rounds < self.rounds) & ((moved > self.tolerance) | (rounds <= PLAIN))
+            return (rounds < self.rounds) & ((moved > self.tolerance) | (rounds <= PLAIN + CONVEX))
 
         def turn(state):
             rounds, _, pose, share = state
             linear = linearised(pair, pose)
             w = normalised(linear, share)
-            new = jnp.where(pair.mask, self.function.weight(w * w), 0.0)
-            share = jnp.where(rounds < PLAIN, share, new)
+            new = jnp.where(rounds < PLAIN + CONVEX, Huber().weight(w * w), self.function.weight(w * w))
+            new = jnp.where(rounds < PLAIN + CONVEX + FULL, new, (share + new) / 2)
+            share = jnp.where(rounds < PLAIN, share, jnp.where(pair.mask, new, 0.0))
             after = stepped(pose, linear, linear.weight * share)
             return rounds + 1, _distance(pose, after), after, share
 
         full = pair.mask.astype(pair.sigma.dtype)
-        _, _, pose, share = lax.while_loop(more, turn, (zero.astype(int), zero + jnp.inf, self.start(pair).pose, full))
-        return pose, share  # pyright: ignore[reportReturnType]
+        start = zero.astype(int), zero + jnp.inf, self.start(pair).pose, full
+        _, moved, pose, share = lax.while_loop(more, turn, start)
+        return moved <= self.tolerance, pose, share  # pyright: ignore[reportReturnType]
 
 
 def _distance(one: RelativePose, other: RelativePose) -> Float[Array, ""]:
