@@ -6,19 +6,13 @@ from functools import partial
 import numpy as np
 
 import jaxro
-from jaxro import starts
 
 from .common import Size, pair_of, rate, ready
 from .metrics import Metric, median_seconds
 from .workload import aerial
 
 
-def _oriented(pair: jaxro.Pair) -> jaxro.Orientation:
-    return jaxro.orient(pair, start=starts.Vertical())
-
-
-def _read(pair: jaxro.Pair) -> tuple[jaxro.Orientation, jaxro.Reliability]:
-    orientation = _oriented(pair)
+def _read(pair: jaxro.Pair, orientation: jaxro.Orientation) -> tuple[jaxro.Orientation, jaxro.Reliability]:
     return orientation, jaxro.assess(pair, orientation, sigma0=0.01)
 
 
@@ -26,7 +20,8 @@ def reading(size: Size) -> list[Metric]:
     """Orientation alone, and with everything `assess` tells, of 10,000 pairs of 16 points on the whole machine."""
     pairs = pair_of(aerial(10_000, 16))
     calls = {
-        name: partial(ready, jaxro.map_batch, f, pairs) for name, f in (("orientation", _oriented), ("both", _read))
+        "orientation": partial(ready, jaxro.orient_batch, pairs),
+        "both": partial(ready, partial(jaxro.orient_batch, read=_read), pairs),
     }
     calls["orientation"]()
     _, found = calls["both"]()

@@ -160,7 +160,8 @@ def robust(size: Size) -> list[Metric]:
         few = case.few if size.robust > 1 else case.few // 8
         good_points = pair_of(share(coordinates, few)).with_mask(jnp.asarray(~wrong[:few]))
         truth = poses(jaxro.orient_batch(good_points, select=pose))
-        right = _share_right(tuple(part[:few] for part in poses(found)), truth)
+        rotation, base = poses(found)
+        right = _share_right((rotation[:few], base[:few]), truth)
         metrics.append(Metric(f"{label}: right, jaxro", right, "of 1", "higher", 0.02, goal=case.least or None))
         metrics += _points(label, "jaxro", np.asarray(mask)[:few], wrong[:few])
         for name, (task, settings) in _settings(_tolerance(procedure, case.points)).items():

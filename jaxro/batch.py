@@ -55,6 +55,7 @@ def orient_batch(
     pairs: Pair,
     *,
     select: Callable[[Orientation], PyTree] = _everything,
+    read: Callable[[Pair, Orientation], PyTree] | None = None,
     progress: Report | None = None,
     threads: int | None = None,
     chunk: int | None = None,
@@ -64,11 +65,13 @@ def orient_batch(
     """`orient` of every pair of a batch (pairs on the leading axis), on all cores.
 
     `select` picks what to keep of each orientation, and XLA computes nothing else: `lambda o: o.pose` is a bare solve.
+    `read`, in its place, makes of a pair and its orientation whatever is wanted, in the same compiled program:
+    `lambda pair, o: assess(pair, o, sigma0=0.01)`. A function object is compiled once.
     `progress(done, total)` is called from the calling thread. Other keywords are those of `orient`. The results are
     those of `orient` one by one, to rounding.
     """
     host, report, way = jax.tree.map(np.asarray, pairs), progress or unheard, Way(threads, chunk)
-    options = settled(pairs.x_left.dtype, options) | {"read": Selected(select)}
+    options = settled(pairs.x_left.dtype, options) | {"read": Selected(select) if read is None else read}
     if not isinstance(start, Auto):
         return _finish(oriented(host, options | {"start": start}, way, report))
     out, fits = oriented_near(host, options | {"start": start}, way, report)

@@ -113,17 +113,21 @@ def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:
 
 
 def rays(left: Matrix | None, right: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar):
-    """The rays R1 p1 and R2 p2 (`left` None for R1 = 1), and w², λ w², μ w² of their closest points λ R1 p1 and
-    b + μ R2 p2:
-
-        w = R1 p1 x R2 p2,    λ w² = (b x R2 p2) . w,    μ w² = (b x R1 p1) . w
-    """
+    """The rays R1 p1 and R2 p2 (`left` None for R1 = 1), and how they meet."""
     x1, y1, x2, y2 = point
     first = (x1, y1, -focal_left) if left is None else rot.apply(left, (x1, y1, -focal_left))
     second = rot.apply(right, (x2, y2, -focal_right))
+    return first, second, *meeting(first, second, base)
+
+
+def meeting(first: Vector, second: Vector, base: Vector) -> tuple[Scalar, Scalar, Scalar]:
+    """w², λ w², μ w² of the closest points λ r1 and b + μ r2 of two rays:
+
+    w = r1 x r2,    λ w² = (b x r2) . w,    μ w² = (b x r1) . w
+    """
     w = rot.cross(first, second)
     lam, mu = (rot.dot(rot.cross(base, ray), w) for ray in (second, first))
-    return first, second, rot.dot(w, w), lam, mu
+    return rot.dot(w, w), lam, mu
 
 
 def intersection(

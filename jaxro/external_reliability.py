@@ -89,24 +89,30 @@ def _heights(pair: Pair, linear: Linear, placed: tuple, slopes: list[tuple], shi
     """Z of every point, its change by the shifts of the parameters and the corrections that follow, and its
     derivatives by the four coordinates."""
 
-    def height(placed, point):
+    rotation, base, third = placed
+
+    def height(first, second, base, third):
         """Z of the point halfway between the rays, in the frame of the elements."""
-        rotation, base, third = placed
-        first, second, squared, lam, mu = coplanarity.rays(
-            None, rotation, base, point, pair.focal_left, pair.focal_right
-        )
+        squared, lam, mu = coplanarity.meeting(first, second, base)
         return ((lam * rot.dot(third, first) + mu * rot.dot(third, second)) / squared + rot.dot(third, base)) / 2
 
-    def one(point):
-        z, pull = jax.vjp(height, placed, point)
-        return z, *pull(jnp.ones_like(z))
+    def one(point, shift):
+        x1, y1, x2, y2 = point
+        right = x2, y2, -pair.focal_right
+        first, second = (x1, y1, -pair.focal_left), rot.apply(rotation, right)
+        z, pull = jax.vjp(height, first, second, base, third)
+        by_first, by_second, *by_shared = pull(jnp.ones_like(z))
+        by_right = rot.apply(rot.transpose(rotation), by_second)
+        # the first three parameters of a pose turn the right photo about its own axes
+        moved = rot.dot(rot.cross(right, by_right), shift[:3])
+        for (_, *slope), s in zip(slopes, shift, strict=True):
+            moved += dot(jax.tree.leaves(by_shared), jax.tree.leaves(slope)) * s
+        return z, moved, (*by_first[:2], *by_right[:2])
 
     # masked points stand where no rays are parallel, so that no derivative divides by zero
     corrected = [c + v for c, v in zip(pair.coordinates, linear.corrections(pair), strict=True)]
     corrected[0] = jnp.where(pair.mask, corrected[0], pair.focal_left)
-    z, by_placed, by_coordinate = jax.vmap(one)(tuple(corrected))
-    leaves = jax.tree.leaves(by_placed)
-    moved = sum(dot(leaves, jax.tree.leaves(slope)) * s for slope, s in zip(slopes, shift, strict=True))
+    z, moved, by_coordinate = jax.vmap(one)(tuple(corrected), shift)
     return z, moved - dot(by_coordinate, linear.gradient) * left, by_coordinate
 
 

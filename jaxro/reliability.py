@@ -40,6 +40,11 @@ PerPoint = Float[Array, "*pairs point"]
 PerPair = Float[Array, "*pairs"]
 PerElement = Float[Array, "*pairs 5"]
 
+Derived = Float[Array | np.ndarray, "*pairs point"]
+"""Of JAX, or of NumPy where the reading is, as in reports."""
+
+Decided = Bool[Array | np.ndarray, "*pairs point"]
+
 UNTESTABLE = 1e-6
 """Redundancy number below which an observation is not checked by the others."""
 
@@ -53,29 +58,29 @@ BOUNDS = (0.01, 0.1, 0.3)
 class Reliability(eqx.Module):
     """The reliability of an orientation; for a batch every field has leading axes. Masked points are zero and False.
 
-    Per point: `redundancy`; `w`, `tau`, `t` with the sign of g; whether it is `testable`: errors in it show at all.
-    Where it is not, w, tau and t are 0 and what could hide is infinite. `effect` of the detectable error on the
-    elements (in their order and unit), `effect_m_q`, and `external`, their bound in standard deviations.
+    Per point: whether it is `used`; `redundancy`; `w`, `tau`, `t` with the sign of g; whether it is `testable`: errors
+    in it show at all. Where it is not, w, tau and t are 0 and what could hide is infinite. `effect` of the detectable
+    error on the elements (in their order and unit), `effect_m_q`, and `external`, their bound in standard deviations.
     Per coordinate (x_left, y_left, x_right, y_right): `coordinate_redundancy`, the `detectable` error in the unit of
-    the coordinates, and `effect_height`: what it does to the model height Z of its point.
+    the coordinates, whose standard deviation is sigma0 `sigma`, and `effect_height`: what it does to the model height Z
+    of its point.
     Per pair: the `largest` effects on the elements, on m_q, and of `external`; `correlation` of the elements;
     `significance`, element over standard deviation (0 for `RelativePose`, whose local parameters have no values).
 
     `sigma0` is the a-priori standard deviation of unit weight where it is `known`, else the estimated one, and w is
-    then tau. `limit`: what |w| exceeds with probability `level` when a point has no error.
+    then tau. `limit`: what |w| exceeds with probability `level` when a point has no error; `delta0`: the error that is
+    found with the power wanted, in standard deviations of w. What follows from other numbers is a property, so that
+    a batch does not write it.
     """
 
+    used: Bool[Array, "*pairs point"]
+    sigma: PerPoint
     redundancy: PerPoint
     w: PerPoint
-    tau: PerPoint
-    t: PerPoint
-    testable: Bool[Array, "*pairs point"]
     coordinate_redundancy: Coordinates
-    detectable: Coordinates
     effect: tuple[PerPoint, ...]
     effect_m_q: PerPoint
     effect_height: Coordinates
-    external: PerPoint
     largest: PerElement
     largest_m_q: PerPair
     largest_external: PerPair
@@ -86,13 +91,54 @@ class Reliability(eqx.Module):
     degrees_of_freedom: Int[Array, "*pairs"]
     level: PerPair
     limit: PerPair
+    delta0: PerPair
     known: bool = eqx.field(static=True)
     power: float = eqx.field(static=True)
 
     @property
-    def suspicious(self) -> Bool[Array, "*pairs point"]:
+    def testable(self) -> Decided:
+        """The points in which an error shows."""
+        able = (self.degrees_of_freedom > (0 if self.known else 1)) & (self.sigma0 > 0)
+        return self.used & (self.redundancy > UNTESTABLE) & able[..., None]
+
+    @property
+    def tau(self) -> Derived:
+        """w by the estimated sigma0."""
+        if not self.known:
+            return self.w
+        xp, there = namespace(self.w), self.estimated > 0
+        return self.w * xp.where(there, self.sigma0 / xp.where(there, self.estimated, 1.0), 0.0)[..., None]
+
+    @property
+    def t(self) -> Derived:
+        """w by sigma0 estimated from the other points, tau sqrt((f - 1) / (f - tau²)); 0 with f = 1."""
+        xp, tau, f = namespace(self.w), self.tau, self.degrees_of_freedom[..., None].astype(self.w.dtype)
+        rest = xp.maximum(f - tau**2, 1e-12)
+        return xp.where(f > 1, tau * xp.sqrt(xp.where(f > 1, f - 1, 1.0) / rest), 0.0)
+
+    @property
+    def detectable(self) -> tuple[Derived, ...]:
+        """Error of each coordinate that is found with the power wanted, delta0 sigma0 sigma / sqrt(r)."""
+        xp, size, testable = namespace(self.w), (self.delta0 * self.sigma0)[..., None] * self.sigma, self.testable
+
+        def of(r: Derived) -> Derived:
+            seen = testable & (r > UNTESTABLE)
+            return xp.where(self.used, xp.where(seen, size / xp.sqrt(xp.where(seen, r, 1.0)), xp.inf), 0.0)
+
+        return tuple(of(r) for r in self.coordinate_redundancy)
+
+    @property
+    def external(self) -> Derived:
+        """Standard deviations by which the detectable error moves an element at most, delta0 sqrt((1 - r) / r)."""
+        xp, testable = namespace(self.w), self.testable
+        r = xp.where(testable, self.redundancy, 1.0)
+        size = self.delta0[..., None] * xp.sqrt(xp.maximum(1 - r, 0.0) / r)
+        return xp.where(self.used, xp.where(testable, size, xp.inf), 0.0)
+
+    @property
+    def suspicious(self) -> Decided:
         """The points whose |w| exceeds the limit. Only the largest is evidence of an error in its own point."""
-        return self.testable & (jnp.abs(self.w) > self.limit[..., None])
+        return self.testable & (abs(self.w) > self.limit[..., None])
 
     @property
     def control(self) -> tuple[Int[Array, "*pairs point"], ...]:
@@ -137,6 +183,11 @@ class Reliability(eqx.Module):
     @property
     def _freedom(self) -> PerPair:
         return jnp.asarray(self.degrees_of_freedom).astype(jnp.asarray(self.estimated).dtype)  # of NumPy in reports
+
+
+def namespace(values: Any) -> Any:
+    """NumPy for its arrays, as reports hold them, else jax.numpy."""
+    return np if isinstance(values, np.ndarray) else jnp
 
 
 def controllability(redundancy: ArrayLike) -> Int[Array, "..."]:
@@ -192,21 +243,11 @@ def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: floa
 
     safe = jnp.where(testable, r, 1.0)
     spread = jnp.where(testable, jnp.sqrt(safe / jnp.where(testable, linear.weight, 1.0)), 1.0)  # sqrt(r D)
-    standard = lambda scale: (
-        jnp.where(testable & (scale > 0), linear.g * linear.weight * spread / safe, 0.0)
-        / jnp.where(scale > 0, scale, 1.0)
-    )
-    tau = standard(estimated)
-    rest = freedom - tau**2
-    outer = testable & (freedom > 1)
-    t = jnp.where(outer, tau * jnp.sqrt(jnp.where(outer, freedom - 1, 1.0) / jnp.where(rest > 1e-12, rest, 1e-12)), 0.0)
-
     tests = _tests(pair.mask.shape[0], known, level, power, familywise)
     delta, limit, each = (critical.by_count(lambda _, t=t: t, pair.mask.shape[0], points) for t in tests)
     # of g: delta sigma0 sqrt(D / r), and what it does to the local parameters of the pose
     jump, shift = stage(_moved)(z, linear.weight, jnp.where(testable, delta * unit * spread / safe, 0.0))
     parts = tuple(b**2 * pair.sigma**2 * linear.weight * r for b in linear.gradient)
-    seen = tuple(testable & (part > UNTESTABLE) for part in parts)
     hidden = lambda value, seen: jnp.where(use, jnp.where(seen, value, jnp.inf), 0.0)
 
     done = effects(pair, orientation, linear, shift, jump, r)
@@ -220,17 +261,14 @@ def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: floa
     spread_of = unit * deviations
     sure = orientation.usable & (spread_of > 0)
     return Reliability(
+        use,
+        jnp.where(use, pair.sigma, 0.0),
         r,
-        standard(unit),
-        tau,
-        t,
-        testable,
+        jnp.where(testable, linear.g * linear.weight * spread / safe, 0.0) / jnp.where(unit > 0, unit, 1.0),
         parts,
-        tuple(hidden(jump / jnp.where(s, jnp.abs(b), 1.0), s) for b, s in zip(linear.gradient, seen, strict=True)),
         effect,
         effect_m_q,
-        tuple(hidden(z, s) for z, s in zip(done.height, seen, strict=True)),
-        external,
+        tuple(hidden(z, testable & (part > UNTESTABLE)) for z, part in zip(done.height, parts, strict=True)),
         jnp.stack([most(e) for e in effect]),
         most(effect_m_q),
         most(external),
@@ -241,6 +279,7 @@ def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: floa
         freedom.astype(int),
         each,
         limit,
+        delta,
         known,
         power,
     )

@@ -34,7 +34,7 @@ class Way(NamedTuple):
     threads: int | None = None
     chunk: int | None = None
     slab: int | None = None
-    calls: int = 4
+    calls: int = 2
 
 
 Report = Callable[[int, int], None]
@@ -60,9 +60,7 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
         size = 1 << max(total - 1, 0).bit_length()
     else:
         most = max(1, SLAB_POINTS // (chunk * max(points, 1)))
-        share = max(1, total // (way.calls * cores * chunk)) if way.calls else -(-total // chunk)
-        # few sizes: each is another program
-        size = chunk * min(most, 1 << share.bit_length() - 1)
+        size = chunk * min(most, _rounded(-(-total // (max(way.calls * cores, 1) * chunk))))
     begins = range(0, total, size)
 
     def part(begin: int) -> PyTree:
@@ -77,7 +75,7 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
     if shape not in run.outputs:  # one call alone compiles; the threads then find the program ready
         first = part(0)
         run.outputs[shape] = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), first)
-    out = jax.tree.map(lambda a: _empty((total, *a.shape[1:]), a.dtype), run.outputs[shape])
+    out = _room(jax.tree.map(lambda a: jax.ShapeDtypeStruct((total, *a.shape[1:]), a.dtype), run.outputs[shape]))
 
     def store(begin: int, result: PyTree) -> int:
         end = min(begin + size, total)
@@ -106,9 +104,21 @@ def _filled(a: np.ndarray, size: int) -> np.ndarray:
     return np.concatenate([a, np.zeros((size - a.shape[0], *a.shape[1:]), a.dtype)])
 
 
-def _empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """Memory for a result, aligned as JAX wants it."""
-    size = math.prod(shape) * dtype.itemsize
-    room = np.empty(size + ALIGNMENT, np.uint8)
-    start = -room.ctypes.data % ALIGNMENT
-    return room[start : start + size].view(dtype).reshape(shape)
+def _rounded(chunks: int) -> int:
+    """Up to four to seven times a power of two: few sizes, each of which is another program."""
+    step = 1 << max(chunks.bit_length() - 3, 0)
+    return -(-chunks // step) * step
+
+
+def _room(shapes: PyTree) -> PyTree:
+    """Memory for a result, aligned as JAX wants it, all in one piece, for which the system gives large pages: each is
+    zeroed at its first use, and the small ones of many pieces cost a fifth of a large result."""
+    leaves, structure = jax.tree.flatten(shapes)
+    sizes = [-(-math.prod(leaf.shape) * leaf.dtype.itemsize // ALIGNMENT) * ALIGNMENT for leaf in leaves]
+    room = np.empty(sum(sizes) + ALIGNMENT, np.uint8)
+    ends = np.cumsum(sizes) + -room.ctypes.data % ALIGNMENT
+    parts = [
+        room[end - size :][: math.prod(leaf.shape) * leaf.dtype.itemsize].view(leaf.dtype).reshape(leaf.shape)
+        for leaf, size, end in zip(leaves, sizes, ends, strict=True)
+    ]
+    return jax.tree.unflatten(structure, parts)

@@ -116,8 +116,8 @@ def _all_parallaxes(pairs_and_poses: tuple[Pair, AbstractElements]) -> Float[Arr
 
 
 READ = (
-    *("redundancy", "w", "tau", "t", "testable", "coordinate_redundancy", "detectable"),
-    *("effect", "effect_m_q", "effect_height", "external"),
+    *("used", "sigma", "redundancy", "w", "coordinate_redundancy"),
+    *("effect", "effect_m_q", "effect_height"),
 )
 """What a reading holds of every point."""
 

@@ -33,15 +33,16 @@ def _points(console: Console, s: Solution, reading: Reliability, units: Units) -
     )
     rows = table("point", "r", w, "found from", "moving Z", "elements", title=title)
     every = range(len(s.measured.points))
+    found_from, moved, suspicious = reading.detectable[3], reading.external, reading.suspicious
     for i in worst(list(every), lambda i: -abs(float(reading.w[i]))):
         size, found, moves = (
             abs(float(reading.w[i])),
-            float(reading.detectable[3][i]),
+            float(found_from[i]),
             float(reading.effect_height[3][i]),
         )
         cells = [number(float(reading.redundancy[i]), 2), number(size, 2), number(found, digits(found, 1))]
-        cells += [number(moves, digits(moves, 1)), number(float(reading.external[i]), 1)]
-        style = "yellow" if bool(reading.testable[i]) and size > float(reading.limit) else None
+        cells += [number(moves, digits(moves, 1)), number(float(moved[i]), 1)]
+        style = "yellow" if suspicious[i] else None
         rows.add_row(escape(s.measured.points[i]), *cells, style=style)
     console.print(rows)
     left_out(console, len(every), "points, those with the largest |w| shown")
@@ -70,7 +71,8 @@ def sentences(s: Solution, units: Units) -> list[str]:
     if names[0]:
         said.append(f"Nothing checks {_listed(names[0])} (redundancy below {BOUNDS[0]}): an error there never shows.")
     if names[1]:
-        hidden = [] if reading is None else [reading.detectable[3][s.measured.points.index(name)] for name in names[1]]
+        every = [] if reading is None else zip(s.measured.points, reading.detectable[3], strict=False)
+        hidden = [found for name, found in every if name in names[1]]
         most = max((float(h) for h in hidden if np.isfinite(h)), default=None)
         size = "" if most is None else f"; an error of {number(most, digits(most, 1))} {units.photo} in y may not show"
         said.append(f"Poorly checked (redundancy below {BOUNDS[1]}): {_listed(names[1])}{size}.")
@@ -122,11 +124,12 @@ def file_rows(solved: list[Solution], units: Units) -> list[list[Any]]:
         if s.reading is None or not s.usable:
             rows += [[s.measured.name, name] + [None] * (len(rows[0]) - 2) for name in s.measured.points]
             continue
-        control = [np.searchsorted(BOUNDS, r, side="right") for r in s.reading.coordinate_redundancy]
+        reading = s.reading
+        control = [np.searchsorted(BOUNDS, r, side="right") for r in reading.coordinate_redundancy]
+        tested, external, sizes = reading.testable, reading.external, (*reading.detectable, *reading.effect_height)
         for i, name in enumerate(s.measured.points):
-            testable = bool(s.reading.testable[i])
-            row = [s.measured.name, name, float(s.reading.redundancy[i])]
-            row += [float(s.reading.w[i]), float(s.reading.limit)] if testable else [None, None]
-            row += [float(s.reading.external[i]), *(CONTROL[c[i]] for c in control)]
-            rows.append([*row, *(float(v[i]) for v in (*s.reading.detectable, *s.reading.effect_height))])
+            row = [s.measured.name, name, float(reading.redundancy[i])]
+            row += [float(reading.w[i]), float(reading.limit)] if tested[i] else [None, None]
+            row += [float(external[i]), *(CONTROL[c[i]] for c in control)]
+            rows.append([*row, *(float(size[i]) for size in sizes)])
     return rows
