@@ -28,7 +28,7 @@ def reading(size: Size) -> list[Metric]:
     worst = float(np.max(np.abs(np.sum(np.asarray(found.redundancy), axis=1) - 11)))
     if not worst <= 1e-9:
         raise ArithmeticError(f"reading: the redundancy numbers of a pair add up to {worst:.1e} beside 11")
-    seconds = median_seconds(calls, size.repeats)
+    seconds = median_seconds(calls, 5 * size.repeats)  # a tenth of a second each, of which page faults are a part
     return [
         rate("reading, 16 points: orientation", seconds["orientation"] / 10_000),
         rate("reading, 16 points: orientation and reliability", seconds["both"] / 10_000),

@@ -45,7 +45,8 @@ def effects(
         jnp.abs(slope * jump / jnp.where(b != 0, b, 1.0) + common) * scale
         for slope, b in zip(by_coordinate, linear.gradient, strict=True)
     )
-    return Effects([jnp.abs(dot(row, shift)) for row in rows], _on_m_q(pair, orientation, linear, shift, jump), height)
+    on_elements = stage(lambda rows, shift: [jnp.abs(dot(row, shift)) for row in rows])(rows, shift)
+    return Effects(on_elements, stage(_on_m_q)(pair, orientation, linear, shift, jump), height)
 
 
 def _of_parameters(orientation: Orientation):

@@ -30,7 +30,7 @@ from . import critical_values as critical
 from .adjustment import root
 from .conditions import Linear, linearised
 from .external_reliability import effects
-from .normal_equations import accumulate, cholesky, substitute
+from .normal_equations import accumulate, inverse
 from .orientation import Orientation
 from .pairs import Coordinates, Pair, cleaned
 from .programs import QUICK, Program, stage, traced
@@ -288,7 +288,9 @@ def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: floa
 def _solved(linear: Linear):
     """N⁻¹ aᵀ and leverage of every point, and Σ g² / d."""
     n, _, squares = accumulate([linear.g], [[c] for c in linear.columns], [linear.weight])
-    z = substitute(cholesky(n)[0], linear.columns)
+    # five products a point by the inverse, where every entry of a substitution would repeat those before it
+    q, _ = stage(inverse)(n)
+    z = [sum(q[max(i, j)][min(i, j)] * c for j, c in enumerate(linear.columns)) for i in range(5)]
     return z, linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True)), squares
 
 
