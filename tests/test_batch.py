@@ -117,6 +117,24 @@ def test_any_function_of_a_pair(pairs):
     assert seen[-1] == (len(pairs.x_left),) * 2
 
 
+def test_a_batch_is_read_as_each_of_its_pairs(pairs):
+    """Whatever is made of a pair and its orientation, those from the vertical and those from the general start; what is
+    derived from a reading, in NumPy as in JAX."""
+    few = jax.tree.map(lambda leaf: leaf[:24], pairs)
+    few = jax.vmap(lambda pair, key: simulation.noisy(pair, key, 0.01))(few, jax.random.split(jax.random.key(3), 24))
+    read = lambda pair, photo: (photo.pose, jaxro.assess(pair, photo, sigma0=0.01))
+    poses, readings = jaxro.orient_batch(few, read=read)
+    loop = problems.jit(jax.vmap(lambda pair, pose: jaxro.assess(pair, jaxro.orient(pair, start=pose), sigma0=0.01)))
+    alone, on_host = loop(few, poses), jax.tree.map(np.asarray, readings)
+    assert np.mean(readings.testable) > 0.4
+    for name in ("w", "tau", "t", "external", "largest_m_q"):
+        np.testing.assert_allclose(getattr(readings, name), getattr(alone, name), rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(getattr(on_host, name), getattr(readings, name), rtol=1e-12)
+    for one, other, third in zip(readings.detectable, alone.detectable, on_host.detectable, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+        np.testing.assert_allclose(third, one, rtol=1e-12)
+
+
 DEVICES = """
 import jax, numpy, jaxro
 from jaxro import batch
