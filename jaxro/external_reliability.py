@@ -39,7 +39,7 @@ def effects(
     rows, placed, slopes = _of_parameters(orientation)
     # the rays are brought together again by -Q Bᵀ / d times what is left of the jump
     left = pair.sigma**2 * linear.weight * redundancy * jump
-    z, common, by_coordinate = stage(_heights)(pair, linear, placed, slopes, shift, left)
+    z, common, by_coordinate = stage(_heights)(pair, orientation.pose, linear, placed, slopes, shift, left)
     scale = _length(pair, orientation, z)
     height = tuple(
         jnp.abs(slope * jump / jnp.where(b != 0, b, 1.0) + common) * scale
@@ -52,8 +52,8 @@ def effects(
 def _of_parameters(orientation: Orientation):
     """Derivatives of the five elements by the local parameters of the pose (5 rows of 5 numbers).
 
-    And what heights depend on (rotation, base in the scale of the model, third row of the model frame), and the
-    derivatives of that by the same parameters.
+    And what heights depend on besides the rays (base in the scale of the model, third row of the model frame), and
+    the derivatives of that by the same parameters.
     """
     system = type(orientation.elements)
     elements = orientation.elements
@@ -64,9 +64,9 @@ def _of_parameters(orientation: Orientation):
         def shared(*x):
             moved = pose.moved(x)
             chosen = convert(moved, system, length)
-            rotation, base = moved.relative()
+            base = moved.relative()[1]
             scaled = rot.scaled(base, length / moved.bx if dependent else length)
-            return (x if system is RelativePose else chosen.values()), (rotation, scaled, chosen.model_frame()[2])
+            return (x if system is RelativePose else chosen.values()), (scaled, chosen.model_frame()[2])
 
         origin = (jnp.zeros_like(length),) * 5
         (_, placed), push = jax.linearize(shared, *origin)
@@ -86,11 +86,19 @@ def _length(pair: Pair, orientation: Orientation, z: Values) -> Array:
     return product / jnp.where(square > 0, square, 1.0)
 
 
-def _heights(pair: Pair, linear: Linear, placed: tuple, slopes: list[tuple], shift: list[Values], left: Values):
+def _heights(
+    pair: Pair,
+    pose: RelativePose,
+    linear: Linear,
+    placed: tuple,
+    slopes: list[tuple],
+    shift: list[Values],
+    left: Values,
+):
     """Z of every point, its change by the shifts of the parameters and the corrections that follow, and its
     derivatives by the four coordinates."""
 
-    rotation, base, third = placed
+    rotation, (base, third) = pose.relative()[0], placed
 
     def height(first, second, base, third):
         """Z of the point halfway between the rays, in the frame of the elements."""
@@ -106,7 +114,7 @@ def _heights(pair: Pair, linear: Linear, placed: tuple, slopes: list[tuple], shi
         by_right = rot.apply(rot.transpose(rotation), by_second)
         # the first three parameters of a pose turn the right photo about its own axes
         moved = rot.dot(rot.cross(right, by_right), shift[:3])
-        for (_, *slope), s in zip(slopes, shift, strict=True):
+        for slope, s in zip(slopes, shift, strict=True):
             moved += dot(jax.tree.leaves(by_shared), jax.tree.leaves(slope)) * s
         return z, moved, (*by_first[:2], *by_right[:2])
 

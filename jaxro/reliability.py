@@ -83,7 +83,6 @@ class Reliability(eqx.Module):
     effect_height: Coordinates
     largest: PerElement
     largest_m_q: PerPair
-    largest_external: PerPair
     correlation: Float[Array, "*pairs 5 5"]
     significance: PerElement
     sigma0: PerPair
@@ -134,6 +133,12 @@ class Reliability(eqx.Module):
         r = xp.where(testable, self.redundancy, 1.0)
         size = self.delta0[..., None] * xp.sqrt(xp.maximum(1 - r, 0.0) / r)
         return xp.where(self.used, xp.where(testable, size, xp.inf), 0.0)
+
+    @property
+    def largest_external(self) -> Float[Array | np.ndarray, "*pairs"]:
+        """The largest of `external`; infinite where the orientation is not usable."""
+        xp = namespace(self.w)
+        return xp.where(xp.any(self.used, axis=-1), xp.max(self.external, axis=-1), xp.inf)
 
     @property
     def suspicious(self) -> Decided:
@@ -253,7 +258,6 @@ def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: floa
     done = effects(pair, orientation, linear, shift, jump, r)
     effect = tuple(hidden(e, testable) for e in done.elements)
     effect_m_q = hidden(done.m_q, testable)
-    external = hidden(delta * jnp.sqrt(jnp.where(testable, h, 0.0) / safe), testable)
     most = lambda value: jnp.where(orientation.usable, jnp.max(value, axis=-1), jnp.inf)
 
     deviations = jnp.sqrt(jnp.diagonal(orientation.cofactor))
@@ -271,7 +275,6 @@ def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: floa
         tuple(hidden(z, testable & (part > UNTESTABLE)) for z, part in zip(done.height, parts, strict=True)),
         jnp.stack([most(e) for e in effect]),
         most(effect_m_q),
-        most(external),
         orientation.cofactor / (deviations[:, None] * deviations[None, :]),
         jnp.where(sure, values / jnp.where(sure, spread_of, 1.0), 0.0),
         unit,

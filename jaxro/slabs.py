@@ -105,7 +105,7 @@ def _filled(a: np.ndarray, size: int) -> np.ndarray:
 
 
 def _rounded(chunks: int) -> int:
-    """Up to four to seven times a power of two: few sizes, each of which is another program."""
+    """Rounded up to four to seven times a power of two: few sizes, since each is another program."""
     step = 1 << max(chunks.bit_length() - 3, 0)
     return -(-chunks // step) * step
 
