@@ -18,6 +18,7 @@ from .orientation import Orientation, orient, orient_near
 from .pairs import Pair
 from .programs import FAST, WIDE, Program, whole
 from .rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
+from .rejection.hypotheses import AbstractHypotheses
 from .slabs import Report, Way, spread, unheard
 from .starts import AbstractStart, Auto
 
@@ -130,7 +131,7 @@ def clean_batch(
     `select=lambda r: r.mask` computes no log and no statistics that the decision does not need.
     """
     host, report, way = jax.tree.map(np.asarray, pairs), progress or unheard, Way(threads, chunk)
-    first, *others = stages(procedure)
+    first, *others = stages(procedure, pairs.x_left.shape[-1])
     out, again = decided(host, first, select, way, report)
     for stage in others:
         rest = np.flatnonzero(again)
@@ -141,9 +142,10 @@ def clean_batch(
     return _finish(out)
 
 
-def stages(procedure: AbstractProcedure) -> Sequence[AbstractProcedure]:
-    """The procedures to be tried in turn, each on the pairs that the one before left in doubt."""
-    return procedure.stages() if isinstance(procedure, Recommended) else (procedure,)
+def stages(procedure: AbstractProcedure, points: int) -> Sequence[AbstractProcedure]:
+    """The procedures to be tried in turn on pairs of up to so many points, each on those that the one before left in
+    doubt."""
+    return procedure.separate(points) if isinstance(procedure, Recommended) else (procedure,)
 
 
 def decided(
@@ -178,7 +180,8 @@ def map_batch(
 
 
 def _by_subsets(procedure: AbstractProcedure) -> bool:
-    return any(hasattr(search, "hypotheses") for search in getattr(procedure, "searches", (procedure,)))
+    subsets = lambda part: isinstance(part, AbstractHypotheses)
+    return any(map(subsets, jax.tree.leaves(procedure, is_leaf=subsets)))
 
 
 def _chunk(pairs: Pair, chunk: int | None) -> int:

@@ -233,17 +233,19 @@ def clean_ragged(
     `select(rejection)`: what is wanted instead, of the pair and of every point; the result then is these two.
     """
     plan = plan or planned(pairs.lengths)
-    first, *others = stages(procedure)
     out = _Out(pairs, progress)
-    again = np.arange(len(pairs.lengths))
-    for number, stage in enumerate((first, *others)):
-        doubtful = [np.zeros(0, int)]
-        sizes = plan.fewer if number else plan.sizes
-        for members, batch, way in _batches(pairs, sizes, None, threads, again):
-            found, doubt = decided(batch, stage, select, way, unheard if number else out.told)
+    every = stages(procedure, max(plan.sizes))
+    doubtful = [[np.zeros(0, int)] for _ in every]  # by the number of procedures that are left for a pair
+    for members, batch, way in _batches(pairs, plan.sizes, None, threads):
+        first, *others = stages(procedure, batch.x_left.shape[1])
+        found, doubt = decided(batch, first, select, way, out.told)
+        out.store(members, found)
+        doubtful[len(others)].append(members[doubt])
+    for left in range(len(every) - 1, 0, -1):
+        for members, batch, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(doubtful[left])):
+            found, doubt = decided(batch, every[-left], select, way, unheard)
             out.store(members, found)
-            doubtful.append(members[doubt])
-        again = np.concatenate(doubtful)
+            doubtful[left - 1].append(members[doubt])
     if select is not decisions:
         return out.tree
     outcome, (kept, order, statistic) = out.tree

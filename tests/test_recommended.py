@@ -13,9 +13,7 @@ from jaxro import simulation
 from jaxro.rejection import OUTCOMES, AllSubsets, DataSnooping, GraduatedNonConvexity, Recommended
 
 RECOMMENDED = Recommended(sigma=0.01)
-NEAR = dataclasses.replace(
-    RECOMMENDED, searches=RECOMMENDED.searches[:4], accidents=RECOMMENDED.accidents[:4], level=0.01
-)
+NEAR = dataclasses.replace(RECOMMENDED, stages=RECOMMENDED.stages[:4], level=0.01)
 """Without the search for photos in any position, which takes long to compile."""
 
 

@@ -14,7 +14,7 @@ Number = bool | int | float | None
 
 
 def tolerances(part: Any) -> dict[str, Number]:
-    """Every number of a procedure; those of its parts behind the name of the part: first.eps3, searches.0.limit."""
+    """Every number of a procedure; those of its parts behind the name of the part: stages.0.search.limit."""
     found: dict[str, Number] = {}
     for name, value in _entries(part).items():
         if isinstance(value, eqx.Module | tuple):

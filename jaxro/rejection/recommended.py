@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .. import critical_values
 from ..conditions import linearised
-from ..elements import RelativePose
+from ..elements import RelativePose, vertical
 from ..pairs import Pair, cleaned
 from ..reductions import count, total
 from .base import OUTCOMES, AbstractProcedure, Rejection
@@ -21,12 +22,21 @@ from .ransac import Ransac
 from .robust import AbstractSearch, agreeing, in_front, judged, one_by_one, scaled, seen
 
 
+class Stage(eqx.Module):
+    """A search; the expected number of accidents up to which it is believed; the fewest points of a pair for it."""
+
+    search: AbstractSearch
+    accidents: float
+    fewest: int = 0
+
+
 class Recommended(AbstractProcedure):
     """Searches, each only where the one before found nothing convincing, then normalised residuals.
 
     1. Graduated non-convexity from the vertical: no subsets, its work grows with n; right in nearly all near-vertical
-       pairs of fifty and more points with half of them wrong.
-    2. Random subsets of five points solved by Newton's method from the vertical: for few points, where 1 fails.
+       pairs of fifty and more points with half of them wrong. Not for pairs of fewer than thirty points, where it
+       sometimes ends beside the optimum, with a set that convinces none the less.
+    2. Random subsets of five points solved by Newton's method from the vertical: for few points, and where 1 fails.
     3. Random subsets of eight points, solved linearly: for photos in any position.
     4. Thirty times as many as in 2: for few points of near-vertical photos, half of them wrong.
     5. Random subsets solved by the five-point method: for what is left, such as plane scenes in any position.
@@ -34,14 +44,14 @@ class Recommended(AbstractProcedure):
     What is found is solved by least squares, and every point, in use or not, judged anew by its normalised residual
     |w| at the familywise `level`, in turns: a good point that a search lost comes back. Where no more than `few` are
     out, the same is done point by point from all points, by which few and small errors are found best; that set is
-    taken if it rests, and convinces or has the smaller Σ r² + limit² (rejected).
+    taken if it rests and has the smaller Σ r² + limit² (rejected).
 
     How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) (u/(1-u))^(k-5) of such
     sets that agree by accident: p = limit / mean |r| of the rejected points is about the share of wrong points that
     agree by chance, u = `wrong` the share of wrong points expected beforehand, without which a dozen points that agree
-    beside three errors of ten sigma would count as an accident. Above `accidents` of a search, or with
-    less than this `share` of the points, which right ones may give a wrong pose as well, the next one follows; above
-    the last of `accidents` the outcome is `no_consensus`. A point behind a photo is rejected, unless infinitely far.
+    beside three errors of ten sigma would count as an accident. Above the `accidents` of a stage, or with less than
+    this `share` of the points, which right ones may give a wrong pose as well, the next stage follows; above those of
+    the last the outcome is `no_consensus`. A point behind a photo is rejected, unless infinitely far.
     """
 
     sigma: float | None = None
@@ -49,14 +59,13 @@ class Recommended(AbstractProcedure):
     rounds: int = 10
     few: int = 7
     wrong: float = 1 / 3
-    searches: tuple[AbstractSearch, ...] = (
-        GraduatedNonConvexity(),
-        Ransac(hypotheses=Newton(), count=32, limit=5.0),
-        Ransac(hypotheses=EightPoint(), count=128, confidence=0.9, limit=5.0),
-        Ransac(hypotheses=Newton(), count=1024, limit=5.0),
-        Ransac(hypotheses=FivePoint(), count=128, limit=5.0),
+    stages: tuple[Stage, ...] = (
+        Stage(GraduatedNonConvexity(), accidents=1e-4, fewest=30),
+        Stage(Ransac(hypotheses=Newton(), count=32, limit=5.0), accidents=1e-3),
+        Stage(Ransac(hypotheses=EightPoint(), count=128, confidence=0.9, limit=5.0), accidents=1e-3),
+        Stage(Ransac(hypotheses=Newton(), count=1024, limit=5.0), accidents=0.05),
+        Stage(Ransac(hypotheses=FivePoint(), count=128, limit=5.0), accidents=0.05),
     )
-    accidents: tuple[float, ...] = (1e-4, 1e-3, 1e-3, 0.05, 0.05)
     share: float = 0.3
 
     def __call__(self, pair: Pair) -> Rejection:
@@ -65,22 +74,24 @@ class Recommended(AbstractProcedure):
         limit = critical_values.by_count(
             lambda n: critical_values.normal(self.level / jnp.maximum(n, 1.0)), pair.x_left.shape[0], count(pair.mask)
         )
-        pose, use = self._found(self.searches[0], fixed, limit)
-        expected = self._accidents(fixed, pose, use, limit)
-        for search, most in zip(self.searches[1:], self.accidents, strict=False):
+        zero = jnp.zeros_like(limit)
+        pose, use, expected, believed = vertical(zero), fixed.mask & False, zero + jnp.inf, 0.0
+        for stage in self.stages:
             enough = count(use) >= self.share * count(fixed.mask)
-            needed = ~((expected <= math.log(most)) & enough)
-            pose, use, expected = self._elsewhere(search, fixed, limit, pose, use, expected, needed)
-        least = self.share if len(self.searches) == 1 else 0.0
-        convinced = (expected <= math.log(self.accidents[-1])) & (count(use) >= least * count(fixed.mask))
+            needed = ~((expected <= believed) & enough) & (count(fixed.mask) >= stage.fewest)
+            pose, use, expected = self._elsewhere(stage.search, fixed, limit, pose, use, expected, needed)
+            believed = math.log(stage.accidents)
+        least = self.share if len(self.stages) == 1 else 0.0
+        convinced = (expected <= believed) & (count(use) >= least * count(fixed.mask))
         return judged(pair, pose, use, limit).only_if(convinced, OUTCOMES.no_consensus)
 
-    def stages(self) -> list["Recommended"]:
-        """The searches as procedures of their own, for batches: each for the pairs that the one before left open."""
-        shares = [self.share] * (len(self.searches) - 1) + [0.0]
+    def separate(self, points: int) -> list["Recommended"]:
+        """The stages of pairs of up to so many points as procedures of their own, for batches: each for the pairs that
+        the one before left open."""
+        shares = [self.share] * (len(self.stages) - 1) + [0.0]
+        stages = zip(self.stages, shares, strict=True)
         return [
-            dataclasses.replace(self, searches=(search,), accidents=(most,), share=share)
-            for search, most, share in zip(self.searches, self.accidents, shares, strict=True)
+            dataclasses.replace(self, stages=(stage,), share=share) for stage, share in stages if stage.fewest <= points
         ]
 
     def _found(self, search: AbstractSearch, pair: Pair, limit: Float[Array, ""]):
@@ -91,8 +102,7 @@ class Recommended(AbstractProcedure):
         # a few small errors do not stand out in a search: the points one by one, beginning with all of them
         few = count(pair.mask & ~best[1]) <= self.few
         other, cost, rests = one_by_one(pair, pose, pair.mask, limit, self.rounds, few)
-        convinces = self._accidents(pair, *other, limit) <= math.log(self.accidents[0])
-        first = rests & ((cost < lowest) | convinces)
+        first = rests & (cost < lowest)
         pose, use = jax.tree.map(lambda a, b: jnp.where(first, a, b), other, best)
         return pose, use & seen(pair, pose, limit)
 
