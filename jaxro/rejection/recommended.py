@@ -44,7 +44,8 @@ class Recommended(AbstractProcedure):
     What is found is solved by least squares, and every point, in use or not, judged anew by its normalised residual
     |w| at the familywise `level`, in turns: a good point that a search lost comes back. Where no more than `few` are
     out, the same is done point by point from all points, by which few and small errors are found best; that set is
-    taken if it rests and has the smaller Σ r² + limit² (rejected).
+    taken if it rests and costs less, by `robust.one_by_one`: among few points, one that would bend the solution to
+    itself is therefore rejected at a |w| a little below the limit.
 
     How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) (u/(1-u))^(k-5) of such
     sets that agree by accident: p = limit / mean |r| of the rejected points is about the share of wrong points that
@@ -55,7 +56,7 @@ class Recommended(AbstractProcedure):
     """
 
     sigma: float | None = None
-    level: float = 0.001
+    level: float = 0.0025
     rounds: int = 10
     few: int = 7
     wrong: float = 1 / 3

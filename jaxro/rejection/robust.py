@@ -19,6 +19,9 @@ from .base import AbstractProcedure, Rejection, Round, began, ended, finished, i
 Values = Float[Array, "point"]
 Use = Bool[Array, "point"]
 
+LEAST = 0.01
+"""No point is taken for less controlled than this when sets are compared: it would go for that alone."""
+
 
 class AbstractSearch(AbstractProcedure):
     """A procedure that finds the pose first, and the wrong points by it."""
@@ -76,14 +79,20 @@ def normalised(linear: Linear, share: Use | Values) -> Values:
     A point in use has the variance 1 - h, h = a N⁻¹ aᵀ its leverage; one not in use has 1 + h;
     in between it is 1 + (1 - 2p) h.
     """
+    return jnp.sqrt(linear.squares / _variance(linear, share))
+
+
+def _variance(linear: Linear, share: Use | Values) -> Values:
     share = share.astype(linear.weight.dtype)
-    weight = linear.weight * share
-    n, _, _ = accumulate([linear.g], [[c] for c in linear.columns], [weight])
-    z = substitute(cholesky(n)[0], linear.columns)
+    factor, _ = cholesky(_normal(linear, share))
+    z = substitute(factor, linear.columns)
     h = linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True))
     h = jnp.where(jnp.isfinite(h), h, 1.0)
-    variance = jnp.maximum(1 + (1 - 2 * share) * h, 1e-6)
-    return jnp.sqrt(linear.squares / variance)
+    return jnp.maximum(1 + (1 - 2 * share) * h, 1e-6)
+
+
+def _normal(linear: Linear, share: Values):
+    return accumulate([linear.g], [[c] for c in linear.columns], [linear.weight * share])[0]
 
 
 def in_front(pair: Pair, pose: RelativePose) -> Use:
@@ -134,26 +143,35 @@ def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds:
 def one_by_one(
     pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int, wanted: Bool[Array, ""] | bool = True
 ):
-    """(pose, points) near the least Σ (r/sigma)² over the points in use + limit² (points rejected), that sum, and
-    whether it rests there.
+    """(pose, points) near the least cost, the cost, and whether it rests there.
 
-    In each round the one point changes sides that lowers the sum most: out, by w² - limit², or in, by limit² - w².
+    The cost is Σ (r/sigma)² over the points in use + limit² (points rejected) + log det N of those in use, minus twice
+    the logarithm of the evidence for that set by Laplace's approximation (MacKay 1992): a wrong point agrees by
+    accident the more easily the less the others say about where it should be. In each round the one point changes
+    sides that lowers the cost most: out, by w² - limit² - log(1 - h), or in, by limit² - w² - log(1 + h). The limit is
+    widened by what this takes from it on the average of n points all in use, log(n / (n - 5)).
     Nothing happens, and nothing rests, where it is not `wanted`.
     """
-    cut, wanted = jnp.asarray(limit, pair.sigma.dtype) ** 2, jnp.asarray(wanted)
+    n = count(pair.mask)
+    cut = jnp.asarray(limit, pair.sigma.dtype) ** 2 + jnp.log(jnp.maximum(n, 6.0) / jnp.maximum(n - 5, 1.0))
 
     def turn(state):
         k, _, pose, use = state
         pose = improved(pair, pose, use)
-        gain = normalised(linearised(pair, pose), use) ** 2 - cut
-        gain = jnp.where(pair.mask, jnp.where(use, gain, -gain), 0.0)
+        linear = linearised(pair, pose)
+        variance = _variance(linear, use)
+        over = linear.squares / variance - cut
+        gain = jnp.where(use, over, -over) - jnp.log(jnp.maximum(variance, LEAST))
+        gain = jnp.where(pair.mask, gain, 0.0)
         best = jnp.max(gain)
         return k + 1, best > 0, pose, use ^ ((gain == best) & (best > 0))
 
-    going, pose, use = _while_needed(rounds, wanted, turn, pose, use)
+    going, pose, use = _while_needed(rounds, jnp.asarray(wanted), turn, pose, use)
     pose = improved(pair, pose, use)
-    squares = linearised(pair, pose).squares
-    cost = total(jnp.where(pair.mask, jnp.where(use, squares, cut), 0.0))
+    linear = linearised(pair, pose)
+    factor, _ = cholesky(_normal(linear, use.astype(linear.weight.dtype)))
+    log_det = -2 * sum(jnp.log(row[i]) for i, row in enumerate(factor))
+    cost = total(jnp.where(pair.mask, jnp.where(use, linear.squares, cut), 0.0)) + log_det
     return (pose, use), jnp.where(jnp.isfinite(cost), cost, jnp.inf), wanted & ~going
 
 
