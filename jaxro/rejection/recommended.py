@@ -64,7 +64,7 @@ class Recommended(AbstractProcedure):
         Stage(GraduatedNonConvexity(), accidents=1e-4, fewest=30),
         Stage(Ransac(hypotheses=Newton(), count=32, limit=5.0), accidents=1e-3),
         Stage(Ransac(hypotheses=EightPoint(), count=128, confidence=0.9, limit=5.0), accidents=1e-3),
-        Stage(Ransac(hypotheses=Newton(), count=1024, limit=5.0), accidents=0.05),
+        Stage(Ransac(hypotheses=Newton(block=64), count=1024, limit=5.0), accidents=0.05),
         Stage(Ransac(hypotheses=FivePoint(), count=128, limit=5.0), accidents=0.05),
     )
     share: float = 0.3

@@ -79,20 +79,19 @@ def normalised(linear: Linear, share: Use | Values) -> Values:
     A point in use has the variance 1 - h, h = a N⁻¹ aᵀ its leverage; one not in use has 1 + h;
     in between it is 1 + (1 - 2p) h.
     """
-    return jnp.sqrt(linear.squares / _variance(linear, share))
+    return jnp.sqrt(linear.squares / _controlled(linear, share)[0])
 
 
-def _variance(linear: Linear, share: Use | Values) -> Values:
+def _controlled(linear: Linear, share: Use | Values) -> tuple[Values, Float[Array, ""]]:
+    """The variance of each r / sigma, and log det N."""
     share = share.astype(linear.weight.dtype)
-    factor, _ = cholesky(_normal(linear, share))
+    n, _, _ = accumulate([linear.g], [[c] for c in linear.columns], [linear.weight * share])
+    factor, _ = cholesky(n)
     z = substitute(factor, linear.columns)
     h = linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True))
     h = jnp.where(jnp.isfinite(h), h, 1.0)
-    return jnp.maximum(1 + (1 - 2 * share) * h, 1e-6)
-
-
-def _normal(linear: Linear, share: Values):
-    return accumulate([linear.g], [[c] for c in linear.columns], [linear.weight * share])[0]
+    inverse_pivots = [row[i] for i, row in enumerate(factor)]
+    return jnp.maximum(1 + (1 - 2 * share) * h, 1e-6), -2 * sum(map(jnp.log, inverse_pivots))  # pyright: ignore[reportReturnType]
 
 
 def in_front(pair: Pair, pose: RelativePose) -> Use:
@@ -143,7 +142,7 @@ def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds:
 def one_by_one(
     pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int, wanted: Bool[Array, ""] | bool = True
 ):
-    """(pose, points) near the least cost, the cost, and whether it rests there.
+    """(pose, points) near the least cost, the cost (before the last change, if it does not rest), and whether it rests.
 
     The cost is Σ (r/sigma)² over the points in use + limit² (points rejected) + log det N of those in use, minus twice
     the logarithm of the evidence for that set by Laplace's approximation (MacKay 1992): a wrong point agrees by
@@ -152,27 +151,24 @@ def one_by_one(
     widened by what this takes from it on the average of n points all in use, log(n / (n - 5)).
     Nothing happens, and nothing rests, where it is not `wanted`.
     """
-    n = count(pair.mask)
+    n, wanted = count(pair.mask), jnp.asarray(wanted)
     cut = jnp.asarray(limit, pair.sigma.dtype) ** 2 + jnp.log(jnp.maximum(n, 6.0) / jnp.maximum(n - 5, 1.0))
 
     def turn(state):
-        k, _, pose, use = state
+        k, _, pose, use, _ = state
         pose = improved(pair, pose, use)
         linear = linearised(pair, pose)
-        variance = _variance(linear, use)
+        variance, log_det = _controlled(linear, use)
+        cost = total(jnp.where(pair.mask, jnp.where(use, linear.squares, cut), 0.0)) + log_det
         over = linear.squares / variance - cut
         gain = jnp.where(use, over, -over) - jnp.log(jnp.maximum(variance, LEAST))
         gain = jnp.where(pair.mask, gain, 0.0)
         best = jnp.max(gain)
-        return k + 1, best > 0, pose, use ^ ((gain == best) & (best > 0))
+        cost = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+        return k + 1, best > 0, pose, use ^ ((gain == best) & (best > 0)), cost
 
-    going, pose, use = _while_needed(rounds, jnp.asarray(wanted), turn, pose, use)
-    pose = improved(pair, pose, use)
-    linear = linearised(pair, pose)
-    factor, _ = cholesky(_normal(linear, use.astype(linear.weight.dtype)))
-    log_det = -2 * sum(jnp.log(row[i]) for i, row in enumerate(factor))
-    cost = total(jnp.where(pair.mask, jnp.where(use, linear.squares, cut), 0.0)) + log_det
-    return (pose, use), jnp.where(jnp.isfinite(cost), cost, jnp.inf), wanted & ~going
+    going, pose, use, cost = _while_needed(rounds, wanted, turn, pose, use, cut + jnp.inf)
+    return (pose, use), cost, wanted & ~going
 
 
 def improved(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
@@ -181,7 +177,7 @@ def improved(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
     return stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
 
 
-def _while_needed(rounds: int, needed: Bool[Array, ""], turn: Callable, pose: RelativePose, use: Use):
-    """(needed, pose, use) after turns (k, needed, pose, use) -> the same, while needed and at most `rounds`."""
-    start = (jnp.zeros((), int), needed, pose, use)
+def _while_needed(rounds: int, needed: Bool[Array, ""], turn: Callable, *state: PyTree):
+    """(needed, *state) after turns (k, needed, *state) -> the same, while needed and at most `rounds`."""
+    start = (jnp.zeros((), int), needed, *state)
     return jax.lax.while_loop(lambda state: state[1] & (state[0] < rounds), turn, start)[1:]
