@@ -71,6 +71,8 @@ def orient_batch(
     `progress(done, total)` is called from the calling thread. Other keywords are those of `orient`. The results are
     those of `orient` one by one, to rounding.
     """
+    if read is not None and select is not _everything:
+        raise ValueError("select and read exclude each other; read sees the orientation, too")
     host, report, way = jax.tree.map(np.asarray, pairs), progress or unheard, Way(threads, chunk)
     options = settled(pairs.x_left.dtype, options) | {"read": Selected(select) if read is None else read}
     if not isinstance(start, Auto):

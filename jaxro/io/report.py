@@ -40,10 +40,9 @@ def _one(console: Console, s: Solution, units: Units, subtitle: str) -> None:
         console.print(elements)
         sigma0 = f"sigma0 {number(s.sigma0, digits(s.sigma0))}" + (f" {units.sigma0}" if units.sigma0 else "")
         m_q = f"m_q {number(s.m_q, digits(s.m_q))} {units.photo}"
-        freedom = int(o.degrees_of_freedom)
-        console.print(
-            f"{sigma0}   {m_q}   {freedom} degree{'s' * (freedom != 1)} of freedom   {o.iterations} iterations"
-        )
+        freedom, rounds = int(o.degrees_of_freedom), int(o.iterations)
+        counted = f"{freedom} degree{'s' * (freedom != 1)} of freedom   {rounds} iteration{'s' * (rounds != 1)}"
+        console.print(f"{sigma0}   {m_q}   {counted}")
         high = {pair: r for pair, r in s.correlations.items() if abs(r) > HIGH}
         named = ", ".join(f"{pair} {100 * r:.1f} %" for pair, r in high.items()) or "none"
         console.print(f"Correlations over {HIGH:.0%}: {named}")
