@@ -6,6 +6,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -62,6 +63,12 @@ class Orientation(eqx.Module):
     def deviations(self) -> Float[Array, "*pairs 5"]:
         """Standard deviations of the elements."""
         return self.sigma0[..., None] * jnp.sqrt(jnp.diagonal(self.cofactor, axis1=-2, axis2=-1))
+
+    @property
+    def correlation(self) -> Float[Array | np.ndarray, "*pairs 5 5"]:
+        """Correlations of the elements."""
+        roots = self.cofactor.diagonal(axis1=-2, axis2=-1) ** 0.5
+        return self.cofactor / (roots[..., :, None] * roots[..., None, :])
 
     @property
     def usable(self) -> Bool[Array, "*pairs"]:

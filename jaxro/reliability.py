@@ -64,8 +64,8 @@ class Reliability(eqx.Module):
     Per coordinate (x_left, y_left, x_right, y_right): `coordinate_redundancy`, the `detectable` error in the unit of
     the coordinates, whose standard deviation is sigma0 `sigma`, and `effect_height`: what it does to the model height Z
     of its point.
-    Per pair: the `largest` effects on the elements, on m_q, and of `external`; `correlation` of the elements;
-    `significance`, element over standard deviation (0 for `RelativePose`, whose local parameters have no values).
+    Per pair: the `largest` effects on the elements, on m_q, and of `external`; `significance`, element over standard
+    deviation (0 for `RelativePose`, whose local parameters have no values).
 
     `sigma0` is the a-priori standard deviation of unit weight where it is `known`, else the estimated one, and w is
     then tau. `limit`: what |w| exceeds with probability `level` when a point has no error; `delta0`: the error that is
@@ -75,7 +75,6 @@ class Reliability(eqx.Module):
 
     used: Bool[Array, "*pairs point"]
     sigma: PerPoint
-    redundancy: PerPoint
     w: PerPoint
     coordinate_redundancy: Coordinates
     effect: tuple[PerPoint, ...]
@@ -83,7 +82,6 @@ class Reliability(eqx.Module):
     effect_height: Coordinates
     largest: PerElement
     largest_m_q: PerPair
-    correlation: Float[Array, "*pairs 5 5"]
     significance: PerElement
     sigma0: PerPair
     estimated: PerPair
@@ -93,6 +91,12 @@ class Reliability(eqx.Module):
     delta0: PerPair
     known: bool = eqx.field(static=True)
     power: float = eqx.field(static=True)
+
+    @property
+    def redundancy(self) -> Derived:
+        """Redundancy number of every point, the sum of those of its coordinates."""
+        first, *others = self.coordinate_redundancy
+        return sum(others, start=first)
 
     @property
     def testable(self) -> Decided:
@@ -181,10 +185,6 @@ class Reliability(eqx.Module):
         f = jnp.where(self._freedom > 0, self._freedom, 1.0)[..., None]
         return jnp.where(size > 0, 2 * ndtr(-size) if self.known else student_p(size, f), 1.0)
 
-    def correlated(self, limit: float = 0.95) -> Bool[Array, "*pairs 5 5"]:
-        """The pairs of elements correlated above the limit, in the upper triangle."""
-        return (jnp.abs(self.correlation) > limit) & jnp.triu(jnp.ones((5, 5), bool), 1)
-
     @property
     def _freedom(self) -> PerPair:
         return jnp.asarray(self.degrees_of_freedom).astype(jnp.asarray(self.estimated).dtype)  # of NumPy in reports
@@ -267,7 +267,6 @@ def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: floa
     return Reliability(
         use,
         jnp.where(use, pair.sigma, 0.0),
-        r,
         jnp.where(testable, linear.g * linear.weight * spread / safe, 0.0) / jnp.where(unit > 0, unit, 1.0),
         parts,
         effect,
@@ -275,7 +274,6 @@ def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: floa
         tuple(hidden(z, testable & (part > UNTESTABLE)) for z, part in zip(done.height, parts, strict=True)),
         jnp.stack([most(e) for e in effect]),
         most(effect_m_q),
-        orientation.cofactor / (deviations[:, None] * deviations[None, :]),
         jnp.where(sure, values / jnp.where(sure, spread_of, 1.0), 0.0),
         unit,
         estimated,

@@ -90,7 +90,7 @@ def test_dense_matrices(system, elements):
         np.testing.assert_allclose(reading.external, size[:, k] * detectable[k], rtol=1e-4)
     np.testing.assert_allclose(reading.largest, np.max(np.stack(reading.effect), axis=1), rtol=0)
     deviations = np.sqrt(np.diag(truth.cofactor))
-    np.testing.assert_allclose(reading.correlation, truth.cofactor / np.outer(deviations, deviations), atol=1e-5)
+    np.testing.assert_allclose(found.correlation, truth.cofactor / np.outer(deviations, deviations), atol=1e-5)
     np.testing.assert_allclose(reading.significance, values / deviations, rtol=1e-5)
 
 

@@ -116,7 +116,7 @@ def _all_parallaxes(pairs_and_poses: tuple[Pair, AbstractElements]) -> Float[Arr
 
 
 READ = (
-    *("used", "sigma", "redundancy", "w", "coordinate_redundancy"),
+    *("used", "sigma", "w", "coordinate_redundancy"),
     *("effect", "effect_m_q", "effect_height"),
 )
 """What a reading holds of every point."""

@@ -139,14 +139,8 @@ class Solution:
         """Correlation of every two elements, "first/second"; empty where not usable."""
         if not self.usable:
             return {}
-        q = self.orientation.cofactor
-        names = type(self.orientation.elements).names
-        deviations = np.sqrt(np.diagonal(q))
-        return {
-            f"{names[i]}/{names[j]}": float(q[i, j] / (deviations[i] * deviations[j]))
-            for i in range(5)
-            for j in range(i + 1, 5)
-        }
+        names, values = type(self.orientation.elements).names, self.orientation.correlation
+        return {f"{names[i]}/{names[j]}": float(values[i, j]) for i in range(5) for j in range(i + 1, 5)}
 
 
 def element_values(found: AbstractElements, cofactor: Array, sigma0: Array) -> tuple[list[Array], list[Array]]:
