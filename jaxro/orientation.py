@@ -264,9 +264,7 @@ def _length(pair: Pair, system: type[AbstractElements], base: ArrayLike | None, 
 
 def _scale(chosen: AbstractElements, pose: RelativePose, length):
     """Length of the base in the model of the chosen elements."""
-    if isinstance(chosen, DependentElements):
-        return length / pose.bx
-    return length
+    return length / pose.bx if isinstance(chosen, DependentElements) else length
 
 
 def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractElements], length):
