@@ -19,7 +19,7 @@ from .pairs import Pair
 from .programs import FAST, WIDE, Program, whole
 from .rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
 from .rejection.hypotheses import AbstractHypotheses
-from .slabs import Report, Way, spread, unheard
+from .slabs import Report, Way, chunked, spread, unheard
 from .starts import AbstractStart, Auto
 
 CHUNK_POINTS = 16384
@@ -199,21 +199,12 @@ def _settings(pairs: Pair) -> dict[str, Any]:
     return FAST if pairs.x_left.shape[1] > FEW else FAST | WIDE
 
 
-def _chunked(one: Callable, pairs: Pair, chunk: int) -> PyTree:
-    """`one` of every pair, chunk after chunk."""
-    count = pairs.x_left.shape[0]
-    if count <= chunk:
-        return jax.vmap(one)(pairs)
-    split = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), pairs)
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), jax.lax.map(jax.vmap(one), split))
-
-
 def _slab(pairs: Pair, *, read: Callable, chunk: int, **options) -> PyTree:
-    return _chunked(lambda pair: read(pair, orient(pair, **options)), pairs, chunk)
+    return chunked(lambda pair: read(pair, orient(pair, **options)), pairs, chunk)
 
 
 def _slab_mapped(pairs: Pair, *, function: Callable, chunk: int) -> PyTree:
-    return _chunked(function, pairs, chunk)
+    return chunked(function, pairs, chunk)
 
 
 def _slab_near(pairs: Pair, *, read: Callable, chunk: int, start: Auto, **options) -> tuple[PyTree, Array]:
@@ -221,7 +212,7 @@ def _slab_near(pairs: Pair, *, read: Callable, chunk: int, start: Auto, **option
         orientation, fits = orient_near(pair, start=start, **options)
         return read(pair, orientation), fits
 
-    return _chunked(one, pairs, chunk)
+    return chunked(one, pairs, chunk)
 
 
 def _slab_cleaned(pairs: Pair, *, procedure: AbstractProcedure, select: Callable, chunk: int) -> tuple[PyTree, Array]:
@@ -231,7 +222,7 @@ def _slab_cleaned(pairs: Pair, *, procedure: AbstractProcedure, select: Callable
         rejection = procedure(pair)
         return select(rejection), rejection.outcome == OUTCOMES.no_consensus
 
-    return _chunked(one, pairs, chunk)
+    return chunked(one, pairs, chunk)
 
 
 def _finish(out: PyTree) -> PyTree:

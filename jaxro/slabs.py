@@ -97,6 +97,16 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
     return out
 
 
+def chunked(one: Callable, data: PyTree, chunk: int) -> PyTree:
+    """`one` of everything on the leading axis, `chunk` at a time, which is a working set that stays in the cache and,
+    where `one` is a loop, how many wait for the last of them."""
+    count = jax.tree.leaves(data)[0].shape[0]
+    if count <= chunk:
+        return jax.vmap(one)(data)
+    split = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), data)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), jax.lax.map(jax.vmap(one), split))
+
+
 def _filled(a: np.ndarray, size: int) -> np.ndarray:
     """The array with zeros (mask False: empty pairs) up to `size` rows."""
     if a.shape[0] == size:

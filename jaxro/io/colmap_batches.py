@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from ..pairs import Pair
 from ..programs import Program
 from ..rejection.ransac import Ransac
-from ..slabs import Way, spread
+from ..slabs import Way, chunked, spread
 from .buckets import buckets
 from .colmap_cameras import PhotoPoints
 from .colmap_orientation import EIGHT, FIVE, SEARCHED, Found, Kind, judged, searched, suffices
@@ -19,7 +19,10 @@ TOGETHER = 2_000_000
 """Matches in memory at once, padding included: some 300 MB."""
 
 IN_CACHE = 16_384
-"""Matches in one call: what stays in the cache of a core."""
+"""Matches that are judged together: what stays in the cache of a core."""
+
+PAIRS = 48
+"""Pairs in one call of a program: its own third of a millisecond hidden, and many calls to share out."""
 
 FEW = 64
 """Matches to which shorter pairs are padded for a search."""
@@ -79,21 +82,20 @@ def _found(block: Block, points: PhotoPoints, size: int, sigma: float, told: Cal
 
 def _by(search: Ransac, few: Fields, every: Fields, told: Callable[[int], None]) -> tuple[Found, np.ndarray]:
     """What was found by this search, and where it sufficed."""
-    chunk = max(1, IN_CACHE // 8 // few[0].shape[1])
     heard = lambda done, total: told(done)
-    pose, tried = spread(few, Program(_all_searched, {"search": search}), Way(slab=chunk), chunk, heard)
+    pose, tried = spread(few, Program(_all_searched, {"search": search}), Way(slab=PAIRS), 1, heard)
     chunk = max(1, IN_CACHE // every[0].shape[1])
-    found = spread((every, pose), Program(_all_judged, {}), Way(slab=chunk), chunk)
+    found = spread((every, pose), Program(_all_judged, {"chunk": chunk}), Way(slab=PAIRS), chunk)
     return found, suffices(search, tried, np.sum(found.kept, axis=1), np.sum(every[5], axis=1))
 
 
 def _all_searched(fields: tuple, *, search: Ransac) -> tuple:
-    return jax.vmap(lambda pair: searched(pair, search))(Pair(*fields))
+    # subsets of one pair are work enough, and no pair waits for another one
+    return chunked(lambda fields: searched(Pair(*fields), search), fields, 1)
 
 
-def _all_judged(found: tuple) -> Found:
-    fields, pose = found
-    return jax.vmap(judged)(Pair(*fields), pose)
+def _all_judged(found: tuple, *, chunk: int) -> Found:
+    return chunked(lambda found: judged(Pair(*found[0]), found[1]), found, chunk)
 
 
 def batch(block: Block, points: PhotoPoints, size: int, sigma: float) -> Fields:
@@ -105,10 +107,17 @@ def batch(block: Block, points: PhotoPoints, size: int, sigma: float) -> Fields:
     n, j = block.lengths[:, None], np.arange(size)[None, :]
     begin = np.cumsum(block.lengths)[:, None] - n
     there = j < n
-    place = np.where(there, begin + np.where(n <= size, j, (j * n + n // 2) // size), 0)
+    taken = np.where(n <= size, j, (j * n + n // 2) // size) if np.any(n > size) else j
+    place = np.where(there, begin + taken, 0)
     left, right = (np.append(side, 0)[place] for side in (block.left, block.right))  # there may be none
     there = there & points.seen[left] & points.seen[right]
-    fill = lambda values, other: np.where(there, values, other)
-    scale = np.sqrt((points.scale[left] ** 2 + points.scale[right] ** 2) / 2)
-    coordinates = [fill(a, 0.0) for a in (points.x[left], points.y[left], points.x[right], points.y[right])]
-    return *coordinates, fill(sigma * scale, 1.0), there, block.focal_left, block.focal_right
+    # in place, since the system zeroes every page of a new array
+    square = points.scale[left] ** 2
+    square += points.scale[right] ** 2
+    square /= 2
+    coordinates = [points.x[left], points.y[left], points.x[right], points.y[right]]
+    scale = np.sqrt(square, out=square)
+    scale *= sigma
+    for values, empty in (*((c, 0.0) for c in coordinates), (scale, 1.0)):
+        np.copyto(values, empty, where=~there)
+    return *coordinates, scale, there, block.focal_left, block.focal_right

@@ -142,18 +142,19 @@ def photo_points(pixels: Float[np.ndarray, "point 2"], cameras: list[PhotoCamera
     names = ("cx", "cy", *COEFFICIENTS)
     rows = [[*c.focals, c.focal, *(c.parameters.get(name, 0.0) for name in names)] for c in cameras]
     of_image = np.array(rows).reshape(-1, 3 + len(names)).T
-    spread = lambda values: np.repeat(values, lengths)  # to the keypoints of every image
-    fx, fy, f, cx, cy = map(spread, of_image[:5])
+    every = lambda values: np.repeat(values, lengths)  # to the keypoints of every image
+    fx, fy, f, cx, cy = (every(a) if np.any(a != a[:1]) else a[:1] for a in of_image[:5])
     u, v = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
     scale = f / np.sqrt(fx * fy)
     seen = np.isfinite(u + v)
     if np.any(of_image[5:]):
-        u, v, det, exists = _in_parts(u, v, list(map(spread, of_image[5:])))
+        u, v, det, exists = _in_parts(u, v, list(map(every, of_image[5:])))
         seen = seen & exists & np.isfinite(u + v)
         scale = scale / np.sqrt(np.where(seen, det, 1.0))
-    if np.all(seen):
-        return PhotoPoints(f * u, -f * v, scale, seen)
-    return PhotoPoints(*(np.where(seen, a, 0.0) for a in (f * u, -f * v, scale)), seen)
+    x, y, scale = f * u, -f * v, np.broadcast_to(scale, seen.shape)
+    if not np.all(seen):
+        x, y, scale = (np.where(seen, a, 0.0) for a in (x, y, scale))
+    return PhotoPoints(x, y, scale, seen)
 
 
 def _in_parts(u: np.ndarray, v: np.ndarray, coefficients: list[np.ndarray]) -> list[np.ndarray]:

@@ -177,7 +177,7 @@ def opened(file: Path, out: Path | None, force: bool) -> Iterator[Database]:
     if out is not None and out.absolute() == file.absolute():
         out = None
     if out is None:
-        with _transaction(file, file) as database:
+        with _said(file), closing(_connection(file)) as connection, _transaction(connection, file) as database:
             _refuse(database, force)
             yield database
         return
@@ -186,28 +186,37 @@ def opened(file: Path, out: Path | None, force: bool) -> Iterator[Database]:
     try:
         with _said(file):
             draft.parent.mkdir(parents=True, exist_ok=True)
-            with closing(sqlite3.connect(file)) as source, closing(sqlite3.connect(draft)) as target:
-                source.backup(target)
-        with _transaction(draft, file) as database:
-            _refuse(database, force)
-            yield database
+            with closing(_connection(draft)) as connection:
+                # a draft that is not finished is thrown away: it needs no journal, and the disk waits until it is
+                connection.execute("PRAGMA journal_mode = MEMORY")
+                connection.execute("PRAGMA synchronous = OFF")
+                with closing(_connection(file)) as source:
+                    source.backup(connection)
+                with _transaction(connection, file) as database:
+                    _refuse(database, force)
+                    yield database
         with _said(out):
+            with draft.open("r+b") as finished:
+                os.fsync(finished.fileno())
             os.replace(draft, out)
     finally:
         for end in ("", "-wal", "-shm", "-journal"):
             draft.with_name(draft.name + end).unlink(missing_ok=True)
 
 
+def _connection(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(path, timeout=WAIT, isolation_level=None)
+
+
 @contextmanager
-def _transaction(path: Path, name: Path) -> Iterator[Database]:
-    with _said(name), closing(sqlite3.connect(path, timeout=WAIT, isolation_level=None)) as connection:
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            yield Database(name, connection)
-            connection.execute("COMMIT")
-        finally:
-            if connection.in_transaction:
-                connection.execute("ROLLBACK")
+def _transaction(connection: sqlite3.Connection, name: Path) -> Iterator[Database]:
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield Database(name, connection)
+        connection.execute("COMMIT")
+    finally:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
 
 
 @contextmanager

@@ -39,8 +39,8 @@ from ..results import RESULTS, is_usable
 from ..starts.general import rotation_only
 
 SEARCHED = 256
-EIGHT = Ransac(EightPoint(), count=128, confidence=0.9, limit=5.0)
-FIVE = Ransac(FivePoint(), count=1024, confidence=0.99, limit=5.0)
+EIGHT = Ransac(EightPoint(block=32), count=128, confidence=0.9, limit=5.0)
+FIVE = Ransac(FivePoint(block=16), count=1024, confidence=0.99, limit=5.0)
 """Enough down to a third of right matches."""
 
 LEVEL = 0.3
@@ -51,8 +51,9 @@ SLACK = 0.1
 ROUNDS = 10
 STEPS = 3
 WIDE = 3.0
-SHIFTS = 8
-"""Other partners that each point is given."""
+SHIFTS, TRIALS = 8, 4096
+"""Other partners that each point is given: at least so many, more where there are few points, to make so many trials.
+"""
 
 ACCIDENTS = 1e-4
 PLANE = 0.8
@@ -215,19 +216,19 @@ def visible(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) ->
 def accidents(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> Float[Array, ""]:
     """Logarithm of the expected number of sets as good by accident."""
     rows, n, k = moved_up(pair), count(pair.mask), count(use)
-    index = jnp.arange(rows.shape[0])
-    number = n.astype(index.dtype)
-    there = index < number
+    size = rows.shape[0]
+    there = jnp.arange(size) < n
+    shifts = max(min(max(SHIFTS, TRIALS // size), size - 1), 1)
 
-    def shifted(i, agree):
-        step = 1 + i * jnp.maximum(number // SHIFTS, 1)
-        partner = (index + step) % jnp.maximum(number, 1)
-        others = rows.at[partner].get(mode="clip")
-        mixed = Pair(
-            rows[:, 0], rows[:, 1], others[:, 2], others[:, 3], pair.sigma, there, pair.focal_left, pair.focal_right
-        )
-        return agree + count(there & (squares(mixed, pose) <= limit**2))
+    def shifted(i, sums):
+        # the places are turned, the empty ones with them: a shift by the number of points would have to gather
+        x, y, also = (lax.dynamic_slice_in_dim(a, 1 + i * (size - 1) // shifts, size) for a in twice)
+        mixed = Pair(rows[:, 0], rows[:, 1], x, y, pair.sigma, there & also, pair.focal_left, pair.focal_right)
+        agree = mixed.mask & (squares(mixed, pose) <= limit**2)
+        return tuple(a + count(b) for a, b in zip(sums, (agree, mixed.mask), strict=True))
 
-    p = (lax.fori_loop(0, SHIFTS, shifted, n * 0) + 1) / (SHIFTS * n + 2)
+    twice = [jnp.concatenate([a, a]) for a in (rows[:, 2], rows[:, 3], there)]
+    agree, trials = lax.fori_loop(0, shifts, shifted, (n * 0, n * 0))
+    p = (agree + 1) / (trials + 2)
     choices = gammaln(n + 1) - gammaln(n - k + 1) - gammaln(6.0) - gammaln(jnp.maximum(k, 5.0) - 4)
     return jnp.where(k > 5, choices + (k - 5) * jnp.log(p) + jnp.log(jnp.maximum(n - 5, 1.0)), jnp.inf)
