@@ -217,7 +217,7 @@ def accidents(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) 
     """Logarithm of the expected number of sets as good by accident."""
     rows, n, k = moved_up(pair), count(pair.mask), count(use)
     size = rows.shape[0]
-    there = jnp.arange(size) < n
+    there = jnp.arange(size, dtype=n.dtype) < n
     shifts = max(min(max(SHIFTS, TRIALS // size), size - 1), 1)
 
     def shifted(i, sums):
