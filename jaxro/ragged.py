@@ -1,6 +1,7 @@
 """Pairs of every length in few batches: flat arrays, padded to the few sizes that waste least."""
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -191,16 +192,22 @@ def orient_ragged(
     options = settled(pairs.x_left.dtype, options) | {"read": read, "start": start}
     out = _Out(pairs, progress)
     rest = [np.zeros(0, int)]
-    for members, batch, way in _batches(pairs, plan.sizes, plan.slabs, threads):
-        if isinstance(start, Auto):
-            found, fits = oriented_near(batch, options, way, out.told)
-            rest.append(members[~fits])
-        else:
-            found = oriented(batch, options, way, out.told)
+
+    def near(members: np.ndarray, size: int, way: Way) -> tuple[np.ndarray, PyTree, np.ndarray]:
+        found, fits = oriented_near(pairs.padded(members, size), options, way)
+        return members, found, members[~fits]
+
+    def given(members: np.ndarray, size: int, way: Way) -> tuple[np.ndarray, PyTree, np.ndarray]:
+        return members, oriented(pairs.padded(members, size), options, way), members[:0]
+
+    first = near if isinstance(start, Auto) else given
+    for members, found, left in _overlapping(first, _batches(pairs, plan.sizes, plan.slabs, threads), threads):
         out.store(members, found)
+        out.told(len(members), len(members))
+        rest.append(left)
     general = options | {"start": getattr(start, "general", start)}
-    for members, batch, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(rest)):
-        out.store(members, oriented(batch, general, way._replace(chunk=GENERAL)))
+    for members, size, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(rest)):
+        out.store(members, oriented(pairs.padded(members, size), general, way._replace(chunk=GENERAL)))
     return eqx.combine(*out.tree) if read is split else out.tree
 
 
@@ -236,14 +243,14 @@ def clean_ragged(
     out = _Out(pairs, progress)
     every = stages(procedure, max(plan.sizes))
     doubtful = [[np.zeros(0, int)] for _ in every]  # by the number of procedures that are left for a pair
-    for members, batch, way in _batches(pairs, plan.sizes, None, threads):
-        first, *others = stages(procedure, batch.x_left.shape[1])
-        found, doubt = decided(batch, first, select, way, out.told)
+    for members, size, way in _batches(pairs, plan.sizes, None, threads):
+        first, *others = stages(procedure, size)
+        found, doubt = decided(pairs.padded(members, size), first, select, way, out.told)
         out.store(members, found)
         doubtful[len(others)].append(members[doubt])
     for left in range(len(every) - 1, 0, -1):
-        for members, batch, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(doubtful[left])):
-            found, doubt = decided(batch, every[-left], select, way, unheard)
+        for members, size, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(doubtful[left])):
+            found, doubt = decided(pairs.padded(members, size), every[-left], select, way, unheard)
             out.store(members, found)
             doubtful[left - 1].append(members[doubt])
     if select is not decisions:
@@ -258,14 +265,26 @@ def _batches(
     slabs: tuple[int, ...] | None,
     threads: int | None,
     members: Int[np.ndarray, " some"] | None = None,
-) -> Iterator[tuple[np.ndarray, Pair, Way]]:
-    """(members, batch, way) of each size; of all pairs or of some. Without `slabs` a call takes one chunk."""
+) -> list[tuple[np.ndarray, int, Way]]:
+    """(members, size to pad them to, way) of each size; of all pairs or of some. Without `slabs` a call takes one
+    chunk."""
     members = np.arange(len(pairs.lengths)) if members is None else np.sort(members)
     bucket = np.searchsorted(sizes, pairs.lengths[members])
-    for number, size in enumerate(sizes):
-        own = members[bucket == number]
-        if own.size:
-            yield own, pairs.padded(own, size), Way(threads, slab=slabs[number] if slabs else 1)
+    every = [members[bucket == number] for number in range(len(sizes))]
+    calls = slabs or (1,) * len(sizes)
+    return [
+        (own, size, Way(threads, slab=call)) for own, size, call in zip(every, sizes, calls, strict=True) if own.size
+    ]
+
+
+def _overlapping(work: Callable, batches: Sequence[tuple], threads: int | None) -> Iterator[tuple]:
+    """work(*batch) of every batch, two at a time unless only one thread is wanted: one is padded, or put in order by
+    the caller, while another is calculated. The longest first, so that both end together."""
+    if threads == 1 or len(batches) == 1:
+        yield from (work(*batch) for batch in batches)
+        return
+    with ThreadPoolExecutor(2) as pool:
+        yield from pool.map(lambda batch: work(*batch), reversed(batches))
 
 
 class _Out:
