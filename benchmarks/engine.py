@@ -1,5 +1,6 @@
 """The suites of the engine: each compares answers, then times, and returns its metrics."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -117,32 +118,40 @@ def _repeated(call: Callable, pair: jaxro.Pair) -> None:
         jax.block_until_ready(call(pair))
 
 
-def latency(size: Size) -> list[Metric]:
-    """One near-vertical pair of 16 points: the compiled function inside `orient`, for the pose as peers return it and
-    for the whole Orientation, then `orient` and `jit(orient)` as called."""
+def latencies(calls: int) -> dict[str, float]:
+    """Microseconds a call of each way to orient one near-vertical pair of 16 points: the compiled function inside
+    `orient`, for the pose as peers return it and for the whole Orientation, then `orient` and `jit(orient)`."""
     pair = jax.device_put(pair_of(tuple(c[0] for c in aerial(1, 16))))
     near = partial(orient_near, start=starts.Auto(steps=0))
-    orient = jax.jit(jaxro.orient)
-    calls: dict[str, Callable] = {
+    ways: dict[str, Callable] = {
         "compiled function, pose": jax.jit(loops(lambda pair: near(pair)[0].pose), compiler_options=QUICK),
         "compiled function, whole Orientation": jax.jit(loops(near), compiler_options=QUICK),
         "orient(pair)": jaxro.orient,
-        "jit(orient)(pair)": orient,
+        "jit(orient)(pair)": jax.jit(jaxro.orient),
     }
-    for call in calls.values():
+    for call in ways.values():
         jax.block_until_ready(call(pair))
-    seconds = median_seconds({name: partial(_repeated, call, pair) for name, call in calls.items()}, size.calls)
-    return [
-        Metric(
-            f"one pair: {name}",
-            value / IN_A_ROW * 1e6,
-            "µs",
-            "lower",
-            0.5,
-            goal=60 if name.startswith("compiled") else None,
-        )
-        for name, value in seconds.items()
-    ]
+    seconds = median_seconds({name: partial(_repeated, call, pair) for name, call in ways.items()}, calls)
+    return {name: value / IN_A_ROW * 1e6 for name, value in seconds.items()}
+
+
+def latency(size: Size) -> list[Metric]:
+    """One pair, as JAX is set (its CPU client hands every call to another thread), and with calls that run where they
+    are made."""
+    metrics = []
+    for label, threaded in (("one pair", True), ("one pair, no asynchronous dispatch", False)):
+        run = _python(f"""
+            import json
+            import jax
+            jax.config.update("jax_cpu_enable_async_dispatch", {threaded})
+            from benchmarks.engine import latencies
+            print(json.dumps(latencies({size.calls})))
+        """)
+        metrics += [
+            Metric(f"{label}: {name}", value, "µs", "lower", 0.5, goal=60 if name.startswith("compiled") else None)
+            for name, value in json.loads(run()).items()
+        ]
+    return metrics
 
 
 def _python(code: str) -> Callable[[], str]:
