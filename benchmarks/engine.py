@@ -122,7 +122,7 @@ def latencies(calls: int) -> dict[str, float]:
     """Microseconds a call of each way to orient one near-vertical pair of 16 points: the compiled function inside
     `orient`, for the pose as peers return it and for the whole Orientation, then `orient` and `jit(orient)`."""
     pair = jax.device_put(pair_of(tuple(c[0] for c in aerial(1, 16))))
-    near = partial(orient_near, start=starts.Auto(steps=0))
+    near = partial(orient_near, start=starts.Auto())
     ways: dict[str, Callable] = {
         "compiled function, pose": jax.jit(loops(lambda pair: near(pair)[0].pose), compiler_options=QUICK),
         "compiled function, whole Orientation": jax.jit(loops(near), compiler_options=QUICK),

@@ -32,6 +32,9 @@ UNROLLED = 12
 SINGULAR = 1e-12
 """Relative pivot below which a parameter counts as undetermined by those before it."""
 
+ROUNDING = 1e3
+"""Times the tolerance: steps below that which do not fall any more have no use."""
+
 
 def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None):
     """N = JᵀWJ, h = JᵀWr and rᵀWr, from residuals and columns that may come in several arrays each."""
@@ -137,12 +140,13 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
 
     `args` that know their own residuals and columns, and how a step follows others (`adjustment.Residuals`), are asked
     for them; any other residual function is linearised. Ends when the *next* step, predicted from the last two, is
-    below atol + rtol |x|. `max_step` bounds the largest component of a step (0.5 rad for orientations, where a longer
-    one leaves the range of the linearisation).
+    below atol + rtol |x|, or below ROUNDING times that if steps no longer fall by half: they are rounding errors then,
+    or converge slowly. `max_step` bounds the largest component of a step (0.5 rad for orientations, where a longer one
+    leaves the range of the linearisation).
     """
 
-    rtol: float = 1e-10
-    atol: float = 1e-10
+    rtol: float = 1e-12
+    atol: float = 1e-12
     max_step: float = float("inf")
     norm: Callable = optx.max_norm
 
@@ -172,7 +176,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
             largest = jnp.maximum(largest, jnp.abs(x))
         size = longest / (self.atol + self.rtol * largest)
         previous = state[1]
-        predicted = size * jnp.where(previous > 0, jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)), 1.0)
+        ratio = jnp.where(previous > 0, jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)), 1.0)
+        predicted = size * jnp.where(ratio > 0.5, ratio / ROUNDING, ratio)
         return jax.tree.unflatten(structure, moved), (predicted, size), None
 
     def terminate(self, fn, y, args, options, state, tags):

@@ -1,6 +1,5 @@
 """Relative orientation of one measured stereo pair: the one call of the README."""
 
-import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -124,9 +123,8 @@ def orient(
     run = lambda function, start: Program(function, options | {"start": start}, QUICK, kernel=kernel)(pair)
     if not isinstance(start, starts.Auto):
         return run(_orient, start)
-    # Two small programs instead of one large: the general start is compiled when a pair first needs it. One pair alone
-    # gains nothing from steps in single precision.
-    orientation, fits = run(orient_near, dataclasses.replace(start, steps=0))
+    # two small programs instead of one large: the general start is compiled when a pair first needs it
+    orientation, fits = run(orient_near, start)
     return orientation if bool(fits) else run(_orient, start.general)
 
 
@@ -144,7 +142,7 @@ def orient_near(
     """The first part of an `Auto` start as an orientation of its own: from the vertical, and whether that fits."""
     max_steps = _most(max_steps, loss)
     most = min(max_steps, NEAR_STEPS) if loss is None else max_steps
-    near = orient(pair, start=starts.Vertical(start.steps), loss=loss, max_steps=most, **options)
+    near = orient(pair, start=starts.Vertical(steps=0), loss=loss, max_steps=most, **options)
     # asks for the count, not for the result, which would cost the statistics where only the pose is wanted
     return near, start.fits(cleaned(pair)[0], near.pose) & ((near.iterations < most) | (most == max_steps))
 

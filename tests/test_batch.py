@@ -35,6 +35,16 @@ def pairs():
     return mixed()
 
 
+def test_batch_equals_one_by_one():
+    layout, keys = simulation.standard_layout(16), jax.random.split(jax.random.key(3), 60)
+    near = jax.vmap(lambda k: simulation.noisy(simulation.mock_pair(layout, focal=100.0), k, 0.01))(keys)
+    together = jaxro.orient_batch(near)
+    for i in range(len(keys)):
+        alone = jaxro.orient(jax.tree.map(lambda a, i=i: a[i], near))
+        for one, other in zip(jax.tree.leaves(together.pose), jax.tree.leaves(alone.pose), strict=True):
+            np.testing.assert_allclose(one[i], other, rtol=0, atol=1e-12)
+
+
 OTHERS = {"threads": 1, "chunk": 16, "elements": DependentElements, "base": 1.0}
 
 
