@@ -45,6 +45,16 @@ def test_batch_equals_one_by_one():
             np.testing.assert_allclose(one[i], other, rtol=0, atol=1e-12)
 
 
+def test_batch_equals_one_by_one_in_any_position():
+    exact, _ = simulation.random_pairs(jax.random.key(5), 60, 12, focal=100.0)
+    anywhere = jax.vmap(lambda p, k: simulation.noisy(p, k, 0.01))(exact, jax.random.split(jax.random.key(6), 60))
+    together = jaxro.orient_batch(anywhere)
+    alone = [jaxro.orient(jax.tree.map(lambda a, i=i: a[i], anywhere)) for i in range(60)]
+    for i in np.flatnonzero(together.usable):
+        for one, other in zip(jax.tree.leaves(together.pose), jax.tree.leaves(alone[i].pose), strict=True):
+            np.testing.assert_allclose(one[i], other, rtol=0, atol=1e-12)
+
+
 OTHERS = {"threads": 1, "chunk": 16, "elements": DependentElements, "base": 1.0}
 
 
