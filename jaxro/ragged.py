@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from itertools import starmap
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -192,18 +193,22 @@ def orient_ragged(
     options = settled(pairs.x_left.dtype, options) | {"read": read, "start": start}
     out = _Out(pairs, progress)
     rest = [np.zeros(0, int)]
+    batches = _batches(pairs, plan.sizes, plan.slabs, threads)
+    in_turn = threads == 1 or len(batches) == 1
+    told = out.told if in_turn else unheard  # what runs beside the calling thread tells nobody
 
     def near(members: np.ndarray, size: int, way: Way) -> tuple[np.ndarray, PyTree, np.ndarray]:
-        found, fits = oriented_near(pairs.padded(members, size), options, way)
+        found, fits = oriented_near(pairs.padded(members, size), options, way, told)
         return members, found, members[~fits]
 
     def given(members: np.ndarray, size: int, way: Way) -> tuple[np.ndarray, PyTree, np.ndarray]:
-        return members, oriented(pairs.padded(members, size), options, way), members[:0]
+        return members, oriented(pairs.padded(members, size), options, way, told), members[:0]
 
     first = near if isinstance(start, Auto) else given
-    for members, found, left in _overlapping(first, _batches(pairs, plan.sizes, plan.slabs, threads), threads):
+    for members, found, left in starmap(first, batches) if in_turn else _overlapping(first, batches):
         out.store(members, found)
-        out.told(len(members), len(members))
+        if not in_turn:
+            out.told(len(members), len(members))
         rest.append(left)
     general = options | {"start": getattr(start, "general", start)}
     for members, size, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(rest)):
@@ -277,12 +282,9 @@ def _batches(
     ]
 
 
-def _overlapping(work: Callable, batches: Sequence[tuple], threads: int | None) -> Iterator[tuple]:
-    """work(*batch) of every batch, two at a time unless only one thread is wanted: one is padded, or put in order by
-    the caller, while another is calculated. The longest first, so that both end together."""
-    if threads == 1 or len(batches) == 1:
-        yield from (work(*batch) for batch in batches)
-        return
+def _overlapping(work: Callable, batches: Sequence[tuple]) -> Iterator[tuple]:
+    """work(*batch) of every batch, two at a time: one is padded, or put in order by the caller, while another is
+    calculated. The longest first, so that both end together."""
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(lambda batch: work(*batch), reversed(batches))
 

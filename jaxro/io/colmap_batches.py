@@ -118,6 +118,7 @@ def batch(block: Block, points: PhotoPoints, size: int, sigma: float) -> Fields:
     coordinates = [points.x[left], points.y[left], points.x[right], points.y[right]]
     scale = np.sqrt(square, out=square)
     scale *= sigma
+    nowhere = ~there
     for values, empty in (*((c, 0.0) for c in coordinates), (scale, 1.0)):
-        np.copyto(values, empty, where=~there)
+        np.copyto(values, empty, where=nowhere)
     return *coordinates, scale, there, block.focal_left, block.focal_right

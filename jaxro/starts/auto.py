@@ -17,7 +17,8 @@ class Auto(AbstractStart):
     "Fit" means: rotation and base within `tilt` (rad) of the normal case and a root mean square distance below
     `tolerance` times the focal length, far above any measuring error and far below what a wrong orientation leaves.
     Of the two solutions of an exactly plane scene this takes the one near the normal case without mention; pass
-    `General()` where photos in other positions look at a plane.
+    `General()` where photos in other positions look at a plane. `steps` count inside a caller's `jit`; alone and in
+    batches all steps from the vertical are taken before it is asked whether they fit.
     """
 
     general: AbstractStart = General()
