@@ -93,7 +93,12 @@ def settled(dtype: Any, options: dict[str, Any]) -> dict[str, Any]:
     return options | {"base": jnp.asarray(options["base"], dtype)}
 
 
-def oriented(pairs: Pair, options: dict[str, Any], way: Way = Way(), report: Report = unheard) -> PyTree:  # noqa: B008
+def oriented(
+    pairs: Pair,
+    options: dict[str, Any],
+    way: Way = Way(),  # noqa: B008 (frozen)
+    report: Report = unheard,
+) -> PyTree:
     """read(pair, orientation) of every pair, in NumPy; `options`: read, start, and those of `orient`."""
     chunk = _chunk(pairs, way.chunk)
     return spread(pairs, Program(_slab, options | {"chunk": chunk}, _settings(pairs)), way, chunk, report)
