@@ -155,7 +155,7 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
         begin = start(lax.stop_gradient(pair))  # the optimum does not depend on where it is sought
     prepare, condition, observations, cofactor = residual(pair)
     # rounding decides where the general start ends, in a batch elsewhere than alone: the solution has to forget it
-    exact = {"rtol": 1e-14, "atol": 1e-14} if isinstance(start, starts.General) else {}
+    own = GaussNewton(1e-14, 1e-14, max_step=0.5) if isinstance(start, starts.General) else GaussNewton(max_step=0.5)
     adjustment = adjust(
         condition,
         begin.pose,
@@ -164,7 +164,7 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
         pair.mask,
         prepare=prepare,
         loss=loss,
-        solver=GaussNewton(**exact, max_step=0.5) if solver is None else solver,
+        solver=own if solver is None else solver,
         max_steps=max_steps,
     )
     solved = adjustment.parameters
