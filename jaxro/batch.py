@@ -35,7 +35,7 @@ ALONE = 1 << 14
 """Points of a batch that are oriented from the vertical before other threads have begun."""
 
 FEW = 32
-"""Points up to which wider vectors gain (3 to 10 %) and one kernel for all (20 %); with more the vectors lose."""
+"""Points up to which wider vectors gain (3 to 10 %) in what is not one kernel; with more they lose."""
 
 
 def _everything(result: Any) -> Any:
@@ -114,8 +114,8 @@ def oriented_near(
     chunk = _chunk(pairs, way.chunk)
     if pairs.x_left.size <= ALONE:
         way = way._replace(threads=way.threads or 1, calls=0)
-    kernel = whole if pairs.x_left.shape[1] <= FEW and options.get("solver") is None else None
-    program = Program(_slab_near, options | {"chunk": chunk}, _settings(pairs), kernel=kernel)
+    kernel = whole if options.get("solver") is None else None
+    program = Program(_slab_near, options | {"chunk": chunk}, FAST | WIDE, kernel=kernel)
     return spread(pairs, program, way, chunk, report)
 
 

@@ -112,11 +112,16 @@ def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:
     return tuple(factor * entry for entry in gradient)  # pyright: ignore[reportReturnType]
 
 
-def rays(left: Matrix | None, right: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar):
-    """The rays R1 p1 and R2 p2 (`left` None for R1 = 1), and how they meet."""
+def directions(left: Matrix | None, right: Matrix, point: Point, focal_left: Scalar, focal_right: Scalar):
+    """The rays R1 p1 and R2 p2 (`left` None for R1 = 1)."""
     x1, y1, x2, y2 = point
-    first = (x1, y1, -focal_left) if left is None else rot.apply(left, (x1, y1, -focal_left))
-    second = rot.apply(right, (x2, y2, -focal_right))
+    first = x1, y1, -focal_left
+    return first if left is None else rot.apply(left, first), rot.apply(right, (x2, y2, -focal_right))
+
+
+def rays(left: Matrix | None, right: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar):
+    """The two `directions`, and how they meet."""
+    first, second = directions(left, right, point, focal_left, focal_right)
     return first, second, *meeting(first, second, base)
 
 
@@ -130,17 +135,15 @@ def meeting(first: Vector, second: Vector, base: Vector) -> tuple[Scalar, Scalar
     return rot.dot(w, w), lam, mu
 
 
-def intersection(
-    left: Matrix, right: Matrix, base: Vector, point: Point, focal_left: Scalar, focal_right: Scalar
-) -> tuple[Vector, Scalar, Scalar]:
-    """Model point halfway between the rays at their closest, and the depth factors λ, μ.
-
-    Parallel rays give λ = μ = inf with the sign of the side they would meet on.
-    """
-    first, second, squared, lam, mu = rays(left, right, base, point, focal_left, focal_right)
+def depths(first: Vector, second: Vector, base: Vector) -> tuple[Scalar, Scalar, Scalar]:
+    """λ w², μ w² and 1 / w²; of parallel rays 0 in place of the last, and the others say on which side they would
+    meet."""
+    squared, lam, mu = meeting(first, second, base)
     parallel = squared == 0
     # divided by a safe number, or a point at infinity would leave NaN in every derivative
-    near = 1 / jnp.where(parallel, 1.0, squared)
-    half = tuple((lam * near * p + b + mu * near * s) / 2 for p, b, s in zip(first, base, second, strict=True))
-    far = lambda side: jnp.where(parallel, jnp.where(side < 0, -jnp.inf, jnp.inf), side * near)
-    return half, far(lam), far(mu)  # pyright: ignore[reportReturnType]
+    return lam, mu, jnp.where(parallel, 0.0, 1 / jnp.where(parallel, 1.0, squared))
+
+
+def halfway(first: Vector, second: Vector, base: Vector, lam: Scalar, mu: Scalar) -> Vector:
+    """The model point halfway between λ r1 and b + μ r2."""
+    return tuple((lam * p + b + mu * s) / 2 for p, b, s in zip(first, base, second, strict=True))  # pyright: ignore

@@ -36,7 +36,7 @@ def margin(pair: Pair, elements: AbstractElements, cofactor: Float[Array, "5 5"]
     m² Σ (|∇g'| / |∇g|)²: the two are equal at m = margin.
     """
     cofactor, units = in_radians(elements, cofactor)
-    direction = stage(_worst)([[cofactor[i, j] for j in range(5)] for i in range(5)])
+    direction = stage(_worst)(cofactor)
     direction = [e * unit for e, unit in zip(direction, units, strict=True)]
 
     def fundamental(t):
@@ -59,9 +59,10 @@ def margin(pair: Pair, elements: AbstractElements, cofactor: Float[Array, "5 5"]
     return jnp.where(drift > 0, jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0)), jnp.inf)
 
 
-def _worst(q: list) -> list:
+def _worst(cofactor: Float[Array, "p p"]) -> list:
     """The eigenvector of the largest eigenvalue of a cofactor matrix, of any length: powers on a column."""
-    n = range(len(q))
+    n = range(len(cofactor))
+    q = [[cofactor[i, k] for k in n] for i in n]
     trace = sum(q[i][i] for i in n)
     q = [[entry / trace for entry in row] for row in q]
     column, most = q[0], q[0][0]

@@ -201,8 +201,10 @@ def height_deviations(adjustment: Adjustment, points: Pair, base: ArrayLike) -> 
         f = coplanarity.fundamental_matrix(*moved.relative(), *focals)
         v = coplanarity.corrections(f, point, jnp.asarray(True))
         corrected = tuple(c + d for c, d in zip(point, v, strict=True))
-        right, along = rot.product(frame, rotation), rot.scaled(rot.apply(frame, along), length)
-        return coplanarity.intersection(frame, right, along, corrected, *focals)[0][2]
+        first, second = coplanarity.directions(frame, rot.product(frame, rotation), corrected, *focals)
+        along = rot.scaled(rot.apply(frame, along), length)
+        lam, mu, near = coplanarity.depths(first, second, along)
+        return coplanarity.halfway(first, second, along, lam * near, mu * near)[2]
 
     def one(point, sigma):
         by_step, by_point = jax.grad(height, argnums=(0, 1))((jnp.zeros_like(q[0, 0]),) * 5, point)

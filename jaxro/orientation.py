@@ -14,6 +14,7 @@ from . import coplanarity, degeneracy, rotations as rot, starts
 from .adjustment import adjust, root
 from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
 from .losses import AbstractLoss
+from .model_points import model_points
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned
 from .programs import FAST, QUICK, Program, loops, traced
@@ -22,9 +23,6 @@ from .results import RESULTS, is_usable
 
 WEAK = 0.04
 """Standard deviation (rad) of a local parameter above which the linearised statistics no longer mean anything."""
-
-AT_INFINITY = 1e-3
-"""Base over distance below which a point counts as infinitely far, so that the sign of its depth says nothing."""
 
 
 class Orientation(eqx.Module):
@@ -177,9 +175,7 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
         use, coplanarity.y_parallax(frames, point, pair.focal_left, pair.focal_right), 0.0
     )
     parallax = jax.vmap(q_of)(pair.coordinates, pair.mask)
-    corrected = tuple(c + dv for c, dv in zip(pair.coordinates, _corrections(pose, pair), strict=True))
-    scale = _scale(chosen, pose, length)
-    model, in_front, far = _model(pair, pose, corrected, chosen.model_frame(), scale)
+    model, in_front, far = model_points(pair, pose, chosen, _scale(chosen, pose, length))
 
     freedom = adjustment.degrees_of_freedom
     checked = freedom > 0
@@ -285,22 +281,6 @@ def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractEl
     jacobian = jax.vmap(push, out_axes=1)(*jnp.eye(5, dtype=cofactor.dtype))
     right = jnp.sum(jacobian[:, :, None] * cofactor[None, :, :], axis=1)
     return at(origin), jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
-
-
-def _model(pair: Pair, pose: RelativePose, corrected: Coordinates, frame: rot.Matrix, scale) -> tuple:
-    """Model points of the corrected coordinates, which of them lie in front, and which are infinitely far."""
-    rotation, base = pose.relative()
-    right, base = rot.product(frame, rotation), rot.scaled(rot.apply(frame, base), scale)
-
-    def one(point, use):
-        model, lam, mu = coplanarity.intersection(frame, right, base, point, pair.focal_left, pair.focal_right)
-        lam, mu = lam / scale, mu / scale
-        near = jnp.minimum(jnp.abs(lam) * pair.focal_left, jnp.abs(mu) * pair.focal_right)
-        far = ~(near * AT_INFINITY < 1)
-        keep = use & jnp.isfinite(lam) & jnp.isfinite(mu)
-        return tuple(jnp.where(keep, c, 0.0) for c in model), use & (lam > 0) & (mu > 0), use & far
-
-    return jax.vmap(one)(corrected, pair.mask)
 
 
 def _undefined(system: type[AbstractElements], pose: RelativePose) -> Bool[Array, ""]:
