@@ -197,7 +197,8 @@ def _chunk(pairs: Pair, chunk: int | None) -> int:
         raise ValueError(f"a batch of pairs (pair, point) is wanted, got coordinates of shape {pairs.x_left.shape}")
     if chunk is not None:
         return chunk
-    return min(128, max(4, 1 << (CHUNK_POINTS // max(pairs.x_left.shape[1], 1)).bit_length() - 1))
+    fitting = max(CHUNK_POINTS // max(pairs.x_left.shape[1], 1), 4)
+    return min(128, 1 << fitting.bit_length() - 1)
 
 
 def _settings(pairs: Pair) -> dict[str, Any]:

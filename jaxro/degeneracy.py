@@ -20,6 +20,8 @@ POWERS = 4
 
 def in_radians(elements: AbstractElements, cofactor: Float[Array, "5 5"]) -> tuple[Float[Array, "5 5"], list]:
     """The cofactors with components of the base over its length, and what each element was divided by."""
+    if all(elements.angles):
+        return cofactor, [1.0] * len(elements.angles)
     _, base = elements.relative()
     length = jnp.sqrt(rot.dot(base, base))
     units = [jnp.ones_like(length) if angle else length for angle in elements.angles]

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from . import coplanarity, rotations as rot
 from .elements import AbstractElements, RelativePose
 from .pairs import Pair
-from .programs import stage
+from .programs import part
 
 Points = tuple[Float[Array, " point"], Float[Array, " point"], Float[Array, " point"]]
 Flags = Bool[Array, " point"]
@@ -44,5 +44,5 @@ def model_points(
         keep = finite & jnp.isfinite(lam) & jnp.isfinite(mu)
         return tuple(jnp.where(keep, c, 0.0) for c in model), in_front, use & ~(finite & (least * AT_INFINITY < 1))
 
-    # a stage, or every result would compute the depths anew
-    return jax.vmap(one)(*stage(jax.vmap(met))(pair.coordinates, pair.mask), pair.mask)
+    # a part: in a kernel the depths are computed once for all results, elsewhere anew for each, which is quicker there
+    return jax.vmap(one)(*part(jax.vmap(met))(pair.coordinates, pair.mask), pair.mask)

@@ -54,7 +54,7 @@ class _Key:
 class Program:
     """data -> function(data, **options), compiled; arrays among the options are passed along as arguments.
 
-    `kernel`: `whole` or `loops`, for arrays of a few thousand numbers, where the compiler can make one of them.
+    `kernel`: `whole` or `loops`, which the compiler may refuse; it is then compiled without.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ def whole(function: Callable) -> Callable:
     """The function as one compiled function of the processor.
 
     XLA's CPU backend compiles a program as many small ones and goes from one to the next at run time, which here costs
-    as much as a fifth of the work. Not for arrays so long that it would spread them over threads.
+    as much as a third of the work.
     """
     return loops(lambda data, **options: _call(lambda data: function(data, **options), **_AS_ONE)(data))
 

@@ -51,6 +51,17 @@ def test_batch_equals_one_by_one(where):
             np.testing.assert_allclose(one[i], other, rtol=0, atol=1e-12)
 
 
+def test_more_points_than_a_chunk_holds():
+    rng = np.random.default_rng(7)
+    x, y, z = rng.uniform((0, -90, -165), (90, 90, -135), (20_000, 3)).T
+    exact = jaxro.pair(*(-150 * a / z for a in (x, y, x - 90, y)), focal=150.0)
+    pairs = jax.vmap(lambda k: simulation.noisy(exact, k, 0.01))(jax.random.split(jax.random.key(7), 2))
+    together = jaxro.orient_batch(pairs, select=lambda o: o.pose)
+    alone = jaxro.orient(jax.tree.map(lambda a: a[1], pairs)).pose
+    for one, other in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_allclose(one[1], other, rtol=0, atol=1e-12)
+
+
 OTHERS = {"threads": 1, "chunk": 16, "elements": DependentElements, "base": 1.0}
 
 
