@@ -152,8 +152,10 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     else:
         begin = start(lax.stop_gradient(pair))  # the optimum does not depend on where it is sought
     prepare, condition, observations, cofactor = residual(pair)
-    # rounding decides where the general start ends, in a batch elsewhere than alone: the solution has to forget it
-    own = GaussNewton(1e-14, 1e-14, max_step=0.5) if isinstance(start, starts.General) else GaussNewton(max_step=0.5)
+    # rounding decides where the general start ends, in a batch elsewhere than alone: the solution has to forget it.
+    # An `Auto` comes here under a caller's jit, for whom a tenth of the time is worth more than a step below 1e-10.
+    least = {starts.General: 1e-14, starts.Auto: 1e-10}.get(type(start), 1e-12)
+    own = GaussNewton(least, least, max_step=0.5)
     adjustment = adjust(
         condition,
         begin.pose,
