@@ -18,8 +18,8 @@ class Auto(AbstractStart):
     `tolerance` times the focal length, far above any measuring error and far below what a wrong orientation leaves.
     Of the two solutions of an exactly plane scene this takes the one near the normal case without mention; pass
     `General()` where photos in other positions look at a plane. `steps` count inside a caller's `jit`, where
-    the last step of the solution is one of 1e-10 instead of 1e-12; alone and in batches all steps from the vertical are
-    taken before it is asked whether they fit.
+    the solution ends when the next step would be below 1e-10 instead of 1e-12; alone and in batches all steps from the
+    vertical are taken before it is asked whether they fit.
     """
 
     general: AbstractStart = General()
