@@ -154,8 +154,8 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
     prepare, condition, observations, cofactor = residual(pair)
     # rounding decides where the general start ends, in a batch elsewhere than alone: the solution has to forget it.
     # An `Auto` comes here under a caller's jit, for whom a tenth of the time is worth more than a step below 1e-10.
-    least = {starts.General: 1e-14, starts.Auto: 1e-10}.get(type(start), 1e-12)
-    own = GaussNewton(least, least, max_step=0.5)
+    tolerance = {starts.General: 1e-14, starts.Auto: 1e-10}.get(type(start), 1e-12)
+    own = GaussNewton(tolerance, tolerance, max_step=0.5)
     adjustment = adjust(
         condition,
         begin.pose,
@@ -224,10 +224,7 @@ def _corrections_of(poses_and_pairs: tuple[RelativePose, Pair]) -> Coordinates:
     if poses_and_pairs[0].qw.ndim:
         return jax.vmap(_corrections_of)(poses_and_pairs)
     pose, pair = poses_and_pairs
-    return _corrections(pose, cleaned(pair)[0])
-
-
-def _corrections(pose: RelativePose, pair: Pair) -> Coordinates:
+    pair, _ = cleaned(pair)
     f = coplanarity.fundamental_matrix(*pose.relative(), pair.focal_left, pair.focal_right)
     return jax.vmap(lambda point, use: coplanarity.corrections(f, point, use))(pair.coordinates, pair.mask)
 
