@@ -101,14 +101,19 @@ def parallax(pair: Pair) -> Adjusted:
     return Adjusted(prepare, of_point, (pair.coordinates, jnp.zeros_like(pair.sigma)), (None, pair.sigma**2))
 
 
+def linearised(f: Matrix, point: Point, use: Bool[Array, "..."]) -> tuple[Scalar, Scalar, Point]:
+    """g of one point, the square |B|² of its gradient by the coordinates (1 where it is not used), and B itself."""
+    g, gradient = jax.value_and_grad(condition, argnums=1)(f, point)
+    return g, jnp.where(use, sum(entry**2 for entry in gradient), 1.0), gradient
+
+
 def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:
     """v = -Q Bᵀ (B Q Bᵀ)⁻¹ g: what brings the rays of one point to intersection with the shortest v.
 
     sigma is equal for the four coordinates of a point, so it cancels.
     """
-    g, gradient = jax.value_and_grad(condition, argnums=1)(f, point)
-    squared = sum(entry**2 for entry in gradient)
-    factor = jnp.where(use, -g / jnp.where(use, squared, 1.0), 0.0)
+    g, square, gradient = linearised(f, point, use)
+    factor = jnp.where(use, -g / square, 0.0)
     return tuple(factor * entry for entry in gradient)  # pyright: ignore[reportReturnType]
 
 

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from . import coplanarity, rotations as rot
-from .elements import AbstractElements, RelativePose
+from .elements import AbstractElements
+from .inspection import Inspection
 from .pairs import Pair
 from .programs import stage
 from .reductions import sums
@@ -47,13 +48,11 @@ def margin(pair: Pair, elements: AbstractElements, cofactor: Float[Array, "5 5"]
 
     zero = jnp.zeros_like(pair.focal_left)
     f, slope = jax.jvp(fundamental, (zero,), (jnp.ones_like(zero),))
-    gradient = jax.grad(coplanarity.condition, argnums=1)
 
     def one(point, sigma, use):
-        square = sum(entry**2 for entry in gradient(f, point))
-        square = jnp.where(use, square, 1.0)
-        change = coplanarity.condition(slope, point) ** 2 / (square * sigma**2)
-        drift = sum(entry**2 for entry in gradient(slope, point)) / square
+        _, square, _ = coplanarity.linearised(f, point, use)
+        g, moved, _ = coplanarity.linearised(slope, point, use)
+        change, drift = g**2 / (square * sigma**2), moved / square
         return jnp.where(use, change, 0.0), jnp.where(use, drift, 0.0)
 
     change, drift = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
@@ -89,17 +88,6 @@ def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:
     return 4 + 12 / jnp.maximum(freedom, 1.0)
 
 
-def pure_rotation(pair: Pair, pose: RelativePose, noise: Float[Array, ""]) -> Bool[Array, ""]:
+def pure_rotation(inspected: Inspection, freedom: Float[Array, ""], noise: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether the directions p1 and R p2 agree to within the measuring error: no parallax, hence no base."""
-    rotation, base = pose.relative()
-
-    def one(point, sigma, use):
-        first, second, w2, *_ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
-        sine2 = w2 / (rot.dot(first, first) * rot.dot(second, second))
-        weight = (pair.focal_left / sigma) ** 2
-        return jnp.where(use, sine2 * weight, 0.0), jnp.where(use, weight, 0.0)
-
-    squared, weight = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
-    count = jnp.maximum(pair.count, 1.0)
-    limit = significant(pair.count - 5) * noise + 1e-9 * jnp.sqrt(weight / count)
-    return jnp.sqrt(squared / count) < limit
+    return inspected.parallax < significant(freedom) * noise + 1e-9 * inspected.precision

@@ -1,6 +1,7 @@
 """Relative orientation of one measured stereo pair: the one call of the README."""
 
 from collections.abc import Callable
+from inspect import signature
 
 import equinox as eqx
 import jax
@@ -13,12 +14,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from . import coplanarity, degeneracy, rotations as rot, starts
 from .adjustment import adjust, root
 from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
+from .inspection import Inspection, inspect
 from .losses import AbstractLoss
 from .model_points import model_points
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned
 from .programs import FAST, QUICK, Program, loops, traced
-from .reductions import count, sums, total
+from .reductions import count, total
 from .results import RESULTS, is_usable
 
 WEAK = 0.04
@@ -126,6 +128,10 @@ def orient(
     return orientation if bool(fits) else run(_orient, start.general)
 
 
+DEFAULTS = {
+    name: option.default for name, option in signature(orient).parameters.items() if option.kind is option.KEYWORD_ONLY
+}
+
 NEAR_STEPS = 10
 """Steps allowed from the vertical without a loss: near-vertical photos take four or five."""
 
@@ -140,12 +146,20 @@ def orient_near(
     """The first part of an `Auto` start as an orientation of its own: from the vertical, and whether that fits."""
     max_steps = _most(max_steps, loss)
     most = min(max_steps, NEAR_STEPS) if loss is None else max_steps
-    near = orient(pair, start=starts.Vertical(steps=0), loss=loss, max_steps=most, **options)
+    options = DEFAULTS | options | dict(start=starts.Vertical(steps=0), loss=loss, max_steps=most)
+    near, inspected = _inspected(pair, **options)
     # asks for the count, not for the result, which would cost the statistics where only the pose is wanted
-    return near, start.fits(cleaned(pair)[0], near.pose) & ((near.iterations < most) | (most == max_steps))
+    return near, start.fits(near.pose, inspected) & ((near.iterations < most) | (most == max_steps))
 
 
-def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_steps) -> Orientation:
+def _orient(pair: Pair, **options) -> Orientation:
+    return _inspected(pair, **options)[0]
+
+
+def _inspected(
+    pair: Pair, *, elements, base, residual, loss, start, solver, max_steps
+) -> tuple[Orientation, Inspection]:
+    """The orientation, and what its pose looks like from the points."""
     pair, bad_input = cleaned(pair)
     if isinstance(start, AbstractElements):
         begin = starts.Begin(start, jnp.asarray(False), jnp.asarray(False))
@@ -168,7 +182,8 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
         max_steps=max_steps,
     )
     solved = adjustment.parameters
-    pose, flipped = _facing(to_pose(solved), pair, isinstance(solved, RelativePose))
+    inspected = inspect(pair, to_pose(solved))
+    pose, flipped = _facing(to_pose(solved), inspected, isinstance(solved, RelativePose))
     length = _length(pair, elements, base, pose)
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
@@ -199,11 +214,11 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
         ((noise**2 * worst > WEAK**2) | (margin < needed * noise), RESULTS.weakly_determined),
     ):
         result = RESULTS.where(fair & condition_holds, code, result)
-    rotated = degeneracy.pure_rotation(pair, pose, noise) | begin.pure_rotation
+    rotated = degeneracy.pure_rotation(inspected, pair.count - 5, noise) | begin.pure_rotation
     result = RESULTS.where(rotated, RESULTS.zero_base, result)
     result = RESULTS.where(freedom < 0, RESULTS.too_few_points, result)
     result = RESULTS.where(bad_input, RESULTS.non_finite_input, result)
-    return Orientation(
+    orientation = Orientation(
         pose,
         chosen,
         q,
@@ -218,6 +233,7 @@ def _orient(pair: Pair, *, elements, base, residual, loss, start, solver, max_st
         adjustment.iterations,
         result,
     )
+    return orientation, inspected
 
 
 def _corrections_of(poses_and_pairs: tuple[RelativePose, Pair]) -> Coordinates:
@@ -229,20 +245,13 @@ def _corrections_of(poses_and_pairs: tuple[RelativePose, Pair]) -> Coordinates:
     return jax.vmap(lambda point, use: coplanarity.corrections(f, point, use))(pair.coordinates, pair.mask)
 
 
-def _facing(pose: RelativePose, pair: Pair, free: bool) -> tuple[RelativePose, Bool[Array, ""]]:
+def _facing(pose: RelativePose, inspected: Inspection, free: bool) -> tuple[RelativePose, Bool[Array, ""]]:
     """The pose with the sign of its base that puts most points in front: g does not know that sign."""
     if not free:
         return pose, jnp.zeros_like(pose.qw, bool)
-    rotation, base = pose.relative()
-
-    def sides(point, use):
-        *_, lam, mu = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
-        return tuple(jnp.where(use, jnp.where(depth > 0, 1.0, -1.0), 0.0) for depth in (lam, mu))
-
-    left, right = sums(jax.vmap(sides)(pair.coordinates, pair.mask))
-    turn = left + right < 0
+    turn = inspected.in_front < 0
     sign = jnp.where(turn, -1.0, 1.0)
-    return RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *rot.scaled(base, sign)), turn
+    return RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *rot.scaled((pose.bx, pose.by, pose.bz), sign)), turn
 
 
 def _length(pair: Pair, system: type[AbstractElements], base: ArrayLike | None, pose: RelativePose):

@@ -6,8 +6,9 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from ..elements import RelativePose, vertical
+from ..inspection import Inspection, inspect
 from ..pairs import Pair, cleaned
-from .base import AbstractStart, Begin, approached, rms_distance
+from .base import AbstractStart, Begin, approached
 from .general import General
 
 
@@ -27,15 +28,15 @@ class Auto(AbstractStart):
     tilt: float = 0.35
     tolerance: float = 1e-3
 
-    def fits(self, pair: Pair, pose: RelativePose) -> Bool[Array, ""]:
+    def fits(self, pose: RelativePose, inspected: Inspection) -> Bool[Array, ""]:
         """Whether a pose reached from the vertical is near it and explains the points; the base may point backwards."""
         longest = 2 * jnp.maximum(jnp.maximum(jnp.abs(pose.qx), jnp.abs(pose.qy)), jnp.abs(pose.qz))
         longest = jnp.maximum(longest, jnp.maximum(jnp.abs(pose.by), jnp.abs(pose.bz)))
-        return (longest < self.tilt) & (rms_distance(pair, pose) < self.tolerance)
+        return (longest < self.tilt) & (inspected.distance < self.tolerance)
 
     def __call__(self, pair: Pair) -> Begin:
         near = approached(pair, vertical(pair.focal_left), self.steps)
-        fits = self.fits(pair, near)
+        fits = self.fits(near, inspect(pair, near))
 
         # A loop of at most one round: under vmap it is entered only if some pair of the batch needs it, where a
         # `cond` would be turned into a `select` and always compute the general start of every pair. The points depend

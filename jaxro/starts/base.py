@@ -6,14 +6,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .. import coplanarity
 from ..adjustment import Residuals
 from ..elements import AbstractElements, RelativePose
 from ..normal_equations import steps
 from ..pairs import Pair
-from ..reductions import total
 
 
 class Begin(NamedTuple):
@@ -37,13 +36,6 @@ def distances(pair: Pair, pose: RelativePose) -> Residuals:
     prepare, condition, observations, _ = coplanarity.rigorous(pair)
     unit = jnp.ones_like(pair.sigma)
     return Residuals(prepare, condition, pose, observations, unit, pair.mask)
-
-
-def rms_distance(pair: Pair, pose: RelativePose) -> Float[Array, ""]:
-    """Root mean square of `distances` at the pose, over the focal length."""
-    zero = jnp.zeros_like(pair.focal_left)
-    r = distances(pair, pose)((zero,) * 5)
-    return jnp.sqrt(total(r * r) / jnp.maximum(pair.count, 1.0)) / pair.focal_left
 
 
 def approached(pair: Pair, pose: RelativePose, count: int) -> RelativePose:

@@ -14,9 +14,10 @@ from jaxtyping import Array, Bool, Float
 from .. import rotations as rot
 from ..degeneracy import significant
 from ..elements import RelativePose, vertical
+from ..inspection import inspect
 from ..normal_equations import steps
 from ..pairs import Pair
-from .base import AbstractStart, Begin, distances, rms_distance
+from .base import AbstractStart, Begin, distances
 from .decomposition import best_pose, cheirality
 from .eight_point import eight_point
 from .five_point import five_point
@@ -51,7 +52,7 @@ class General(AbstractStart):
         score = jnp.where(found, _scores(pair, chosen, left, right), jnp.inf)
         best, alone = _best_different(chosen, score, 2)
         first, second = (jax.tree.map(lambda a, i=i: a[i], best) for i in (0, 1))
-        squares, other = rms_distance(pair, first) ** 2, rms_distance(pair, second) ** 2
+        squares, other = (inspect(pair, pose).distance ** 2 for pose in (first, second))
         freedom = pair.count - 5
         slack = jnp.where(freedom > 0, 10 / jnp.where(freedom > 0, freedom, 1.0), 0.0)
         ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
@@ -105,7 +106,7 @@ def _scores(pair: Pair, poses: RelativePose, left, right) -> Float[Array, " cand
 
     def one(pose):
         wrong = _behind(pose, left, right, pair.mask) > BEHIND
-        score = jnp.maximum(rms_distance(pair, pose) ** 2, EXACT) + jnp.where(wrong, 1.0, 0.0)
+        score = jnp.maximum(inspect(pair, pose).distance ** 2, EXACT) + jnp.where(wrong, 1.0, 0.0)
         return jnp.where(jnp.isfinite(score), score, jnp.inf)
 
     return jax.vmap(one)(poses)
@@ -141,7 +142,7 @@ def _refined(pair: Pair, pose: RelativePose, count: int) -> RelativePose:
     """The pose after some Gauss-Newton steps, or unchanged where they fail."""
     zero = jnp.zeros_like(pair.focal_left)
     moved = pose.moved(steps(distances(pair, pose), (zero,) * 5, count, 0.3)).normalised()
-    better = rms_distance(pair, moved) <= rms_distance(pair, pose)
+    better = inspect(pair, moved).distance <= inspect(pair, pose).distance
     return jax.tree.map(lambda new, old: jnp.where(better, new, old), moved, pose)
 
 

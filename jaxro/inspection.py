@@ -1,0 +1,48 @@
+"""What one pass over the points tells of a pose.
+
+On which side of the photos the points lie, how far they are from the condition, and how far apart their rays are:
+asked one after the other, each from points read once more, these took a third of the time of a pose of many points.
+Sums that nobody asks for the compiler leaves out.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from . import coplanarity, rotations as rot
+from .elements import RelativePose
+from .pairs import Pair
+from .reductions import sums
+
+
+class Inspection(NamedTuple):
+    """`in_front`: Σ of the signs of both depths, negative where the base points to the wrong side. `distance`: root
+    mean square distance of the points from the condition, to first order, over the left focal length. `parallax`: root
+    mean square angle between p1 and R p2, that is without a base, in units of the standard deviation of a coordinate
+    seen from the photo; `precision`: root mean square of that unit's inverse, f / sigma."""
+
+    in_front: Float[Array, ""]
+    distance: Float[Array, ""]
+    parallax: Float[Array, ""]
+    precision: Float[Array, ""]
+
+
+def inspect(pair: Pair, pose: RelativePose) -> Inspection:
+    """`Inspection` of a pair (finite coordinates, masked points zero) at a pose."""
+    rotation, base = pose.relative()
+    focals = pair.focal_left, pair.focal_right
+    f = coplanarity.fundamental_matrix(rotation, base, *focals)
+
+    def one(point, sigma, use):
+        first, second, w2, *depths = coplanarity.rays(None, rotation, base, point, *focals)
+        left, right = (jnp.where(depth > 0, 1.0, -1.0) for depth in depths)
+        g, square, _ = coplanarity.linearised(f, point, use)
+        weight = (pair.focal_left / sigma) ** 2
+        sine2 = w2 / (rot.dot(first, first) * rot.dot(second, second))
+        return tuple(jnp.where(use, term, 0.0) for term in (left + right, g * g / square, sine2 * weight, weight))
+
+    in_front, *squares = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
+    distance, parallax, precision = (jnp.sqrt(square / jnp.maximum(pair.count, 1.0)) for square in squares)
+    return Inspection(in_front, distance / pair.focal_left, parallax, precision)
