@@ -14,6 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from . import memory
 from .programs import Program
 
 SLAB_POINTS = 1 << 17
@@ -125,7 +126,7 @@ def _room(shapes: PyTree) -> PyTree:
     zeroed at its first use, and the small ones of many pieces cost a fifth of a large result."""
     leaves, structure = jax.tree.flatten(shapes)
     sizes = [-(-math.prod(leaf.shape) * leaf.dtype.itemsize // ALIGNMENT) * ALIGNMENT for leaf in leaves]
-    room = np.empty(sum(sizes) + ALIGNMENT, np.uint8)
+    room = memory.RESULTS.room(sum(sizes) + ALIGNMENT)
     ends = np.cumsum(sizes) + -room.ctypes.data % ALIGNMENT
     parts = [
         room[end - size :][: math.prod(leaf.shape) * leaf.dtype.itemsize].view(leaf.dtype).reshape(leaf.shape)

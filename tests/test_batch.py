@@ -14,6 +14,7 @@ import pytest
 
 import jaxro
 from jaxro import DependentElements, batch, simulation, starts
+from jaxro.memory import LARGE, Memory
 from jaxro.programs import FAST, Program, whole
 
 
@@ -132,6 +133,29 @@ def test_batches_from_two_threads_at_once(pairs):
         results = list(pool.map(lambda _: jaxro.orient_batch(pairs).pose.base, range(8)))
     for base in results:
         np.testing.assert_array_equal(base, expected)
+
+
+def test_memory_is_used_again_only_when_nobody_holds_it(pairs):
+    store, size = Memory(4 * LARGE), 2 * LARGE
+    first = store.room(size)
+    address, view = first.ctypes.data, first[100:200].view(np.int32)
+    del first
+    second = store.room(size)
+    assert not np.shares_memory(second, view)
+    del view
+    assert store.room(size - 1).ctypes.data == address  # given back at once
+    three = [store.room(size) for _ in range(3)]
+    del second, three
+    assert sum(piece.nbytes for piece in store.kept) <= store.limit
+    # a result that is held, even only a part of it, stays what it was
+    many = jax.tree.map(lambda a: np.tile(np.asarray(a), (400, *[1] * (a.ndim - 1))), pairs)
+    once = jaxro.orient_batch(many).model[0]
+    kept, copy = np.asarray(once), np.array(once)
+    del once
+    turned = jax.tree.map(lambda a: a[::-1], many)
+    again = np.asarray(jaxro.orient_batch(turned).model[0])
+    np.testing.assert_array_equal(kept, copy)
+    assert not np.array_equal(again, copy)
 
 
 def test_any_function_of_a_pair(pairs):
