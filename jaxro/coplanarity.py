@@ -73,11 +73,10 @@ def turned(rotation: Matrix, base: Vector) -> tuple[Matrix, Matrix]:
 def y_parallax(rows: tuple, point: Point, focal_left: Scalar, focal_right: Scalar) -> Scalar:
     """q = y1* - y2* = -f1 (Y1/Z1 - Y2/Z2) of one point; `rows` are the Y and Z rows of the two rotations `turned`."""
     x1, y1, x2, y2 = point
-    first, second = (x1, y1, -focal_left), (x2, y2, -focal_right)
-    left, right = rows
-    return -focal_left * (
-        rot.dot(left[0], first) / rot.dot(left[1], first) - rot.dot(right[0], second) / rot.dot(right[1], second)
-    )
+    rays = (x1, y1, -focal_left), (x2, y2, -focal_right)
+    (y1, z1), (y2, z2) = ([rot.dot(row, ray) for row in turn] for turn, ray in zip(rows, rays, strict=True))
+    # one division, and that by itself: its derivatives then divide no more, which is a tenth of a solution
+    return focal_left * (y2 * z1 - y1 * z2) * (1 / (z1 * z2))
 
 
 def rigorous(pair: Pair) -> Adjusted:
