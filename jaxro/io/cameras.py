@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from ..pairs import Camera, Pair
@@ -135,4 +135,4 @@ def to_pair(measured: Measurements, file: str, left: Camera, right: Camera, sigm
             expected = "coordinates in photo units where the pixel sizes differ, so that one sigma serves both photos"
             raise TableError(file, measured.lines[0], "sigma", found, expected)
     fields = (*coordinates, deviation, np.ones(count, bool), np.float64(left.focal), np.float64(right.focal))
-    return Pair(*map(jnp.asarray, fields))
+    return Pair(*jax.device_put(fields))

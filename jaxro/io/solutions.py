@@ -67,7 +67,8 @@ def read(orientation: Orientation, pair: Pair, reliable: bool, sigma_known: bool
     standard deviations.
     """
     reading = None
-    if reliable and (sigma_known or np.max(orientation.degrees_of_freedom, initial=0) > 1):  # else nothing is testable
+    freedom = np.asarray(orientation.degrees_of_freedom)
+    if reliable and (sigma_known or np.max(freedom, initial=0) > 1):  # else nothing is testable
         options = {"sigma0": jnp.ones(()) if sigma_known else None}
         one = jnp.ndim(orientation.sigma0) == 0
         reading = Program(_assessed if one else _all_assessed, options, QUICK if one else FAST)((pair, orientation))
