@@ -298,8 +298,7 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
     q, pivot = normal.inverse(n)
     redundancy = []
     for c in range(len(r)):
-        column = [jacobian[k][c] for k in range(p)]
-        taken = sum((1.0 if i == j else 2.0) * q[i][j] * column[i] * column[j] for i in range(p) for j in range(i + 1))
+        taken = normal.quadratic(q, [jacobian[k][c] for k in range(p)])
         redundancy.append(jnp.where(residuals.mask, 1 - (taken if weight is None else weight[c] * taken), 0.0))
     freedom = len(r) * count(residuals.mask).astype(int) - p
     checked = freedom > 0

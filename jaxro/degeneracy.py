@@ -15,6 +15,9 @@ from .pairs import Pair
 from .programs import stage
 from .reductions import sums
 
+ROUNDING = 1e-9
+"""Angle (rad) between two rays that a computer cannot tell from zero."""
+
 POWERS = 4
 """Of the cofactor matrix: enough to separate its largest eigenvalue where that matters."""
 
@@ -52,8 +55,8 @@ def margin(pair: Pair, elements: AbstractElements, cofactor: Float[Array, "5 5"]
     def one(point, sigma, use):
         _, square, _ = coplanarity.linearised(f, point, use)
         g, moved, _ = coplanarity.linearised(slope, point, use)
-        change, drift = g**2 / (square * sigma**2), moved / square
-        return jnp.where(use, change, 0.0), jnp.where(use, drift, 0.0)
+        weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
+        return g**2 * weight, moved * sigma**2 * weight
 
     change, drift = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
     ratio = change / jnp.where(drift > 0, drift, 1.0)
@@ -90,4 +93,4 @@ def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:
 
 def pure_rotation(inspected: Inspection, freedom: Float[Array, ""], noise: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether the directions p1 and R p2 agree to within the measuring error: no parallax, hence no base."""
-    return inspected.parallax < significant(freedom) * noise + 1e-9 * inspected.precision
+    return (inspected.parallax < significant(freedom) * noise) | (inspected.angle < ROUNDING)

@@ -14,7 +14,7 @@ from . import coplanarity, rotations as rot
 from .adjustment import root
 from .conditions import Linear, Values
 from .elements import DependentElements, IndependentElements, RelativePose, convert
-from .normal_equations import accumulate
+from .normal_equations import accumulate, quadratic
 from .orientation import Orientation
 from .pairs import Coordinates, Pair
 from .programs import stage
@@ -103,7 +103,7 @@ def _heights(
     def height(first, second, base, third):
         """Z of the point halfway between the rays, in the frame of the elements."""
         squared, lam, mu = coplanarity.meeting(first, second, base)
-        return ((lam * rot.dot(third, first) + mu * rot.dot(third, second)) / squared + rot.dot(third, base)) / 2
+        return rot.dot(third, coplanarity.halfway(first, second, base, lam / squared, mu / squared))
 
     def one(point, shift):
         x1, y1, x2, y2 = point
@@ -145,9 +145,7 @@ def _on_m_q(pair: Pair, orientation: Orientation, linear: Linear, shift: list[Va
 
     own = jnp.where(pair.mask, jax.vmap(ratio)(pair.coordinates), 0.0) ** 2
     n, s, qq = accumulate([linear.g], [[column] for column in linear.columns], [own])
-    square = dot(
-        [sum((1.0 if i == j else 2.0) * n[i][j] * shift[j] for j in range(i + 1)) for i in range(5)], shift
-    ) + own * jump * (2 * dot(linear.columns, shift) + jump)
+    square = quadratic(n, shift) + own * jump * (2 * dot(linear.columns, shift) + jump)
     cross = dot(s, shift) + own * linear.g * jump
     freedom = orientation.degrees_of_freedom
     f = jnp.where(freedom > 0, freedom, 1).astype(own.dtype)

@@ -19,14 +19,14 @@ from .reductions import sums
 
 class Inspection(NamedTuple):
     """`in_front`: Σ of the signs of both depths, negative where the base points to the wrong side. `distance`: root
-    mean square distance of the points from the condition, to first order, over the left focal length. `parallax`: root
-    mean square angle between p1 and R p2, that is without a base, in units of the standard deviation of a coordinate
-    seen from the photo; `precision`: root mean square of that unit's inverse, f / sigma."""
+    mean square distance of the points from the condition, to first order, over the left focal length. `angle`: root
+    mean square sine of the angle between p1 and R p2, that is without a base; `parallax`: the same in units of the
+    standard deviation of a coordinate seen from the photo, sigma / f."""
 
     in_front: Float[Array, ""]
     distance: Float[Array, ""]
+    angle: Float[Array, ""]
     parallax: Float[Array, ""]
-    precision: Float[Array, ""]
 
 
 def inspect(pair: Pair, pose: RelativePose) -> Inspection:
@@ -39,10 +39,10 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
         first, second, w2, *depths = coplanarity.rays(None, rotation, base, point, *focals)
         left, right = (jnp.where(depth > 0, 1.0, -1.0) for depth in depths)
         g, square, _ = coplanarity.linearised(f, point, use)
-        weight = (pair.focal_left / sigma) ** 2
-        sine2 = w2 / (rot.dot(first, first) * rot.dot(second, second))
-        return tuple(jnp.where(use, term, 0.0) for term in (left + right, g * g / square, sine2 * weight, weight))
+        ratio = w2 / (rot.dot(first, first) * rot.dot(second, second) * sigma**2)
+        terms = left + right, g * g / square, ratio * sigma**2, ratio * pair.focal_left**2
+        return tuple(jnp.where(use, term, 0.0) for term in terms)
 
     in_front, *squares = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
-    distance, parallax, precision = (jnp.sqrt(square / jnp.maximum(pair.count, 1.0)) for square in squares)
-    return Inspection(in_front, distance / pair.focal_left, parallax, precision)
+    distance, angle, parallax = (jnp.sqrt(square / jnp.maximum(pair.count, 1.0)) for square in squares)
+    return Inspection(in_front, distance / pair.focal_left, angle, parallax)

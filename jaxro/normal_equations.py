@@ -108,6 +108,11 @@ def substitute(factor: Lower, h: Scalars) -> list[Any]:
     return x
 
 
+def quadratic(q: Lower, a: Sequence[Any]) -> Any:
+    """aᵀ Q a of a symmetric matrix, given by its lower triangle; of many a at once where their entries are arrays."""
+    return sum(a[i] * sum((1.0 if i == j else 2.0) * q[i][j] * a[j] for j in range(i + 1)) for i in range(len(a)))
+
+
 def dense(n: Lower) -> Float[Array, "p p"]:
     """The symmetric matrix as an array."""
     p = len(n)
