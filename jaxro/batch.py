@@ -69,7 +69,8 @@ def orient_batch(
     `read`, in its place, makes of a pair and its orientation whatever is wanted, in the same compiled program:
     `lambda pair, o: assess(pair, o, sigma0=0.01)`. A function object is compiled once.
     `progress(done, total)` is called from the calling thread. Other keywords are those of `orient`. The results are
-    those of `orient` one by one, to rounding.
+    those of `orient` one by one, to rounding. Up to 256 MB of results that nobody holds any more are kept as memory for
+    the next ones.
     """
     if read is not None and select is not _everything:
         raise ValueError("select and read exclude each other; read sees the orientation, too")

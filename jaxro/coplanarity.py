@@ -75,7 +75,7 @@ def y_parallax(rows: tuple, point: Point, focal_left: Scalar, focal_right: Scala
     x1, y1, x2, y2 = point
     rays = (x1, y1, -focal_left), (x2, y2, -focal_right)
     (y1, z1), (y2, z2) = ([rot.dot(row, ray) for row in turn] for turn, ray in zip(rows, rays, strict=True))
-    # one division, and that by itself: its derivatives then divide no more, which is a tenth of a solution
+    # one division, and that by itself: its derivatives then divide no more: a twelfth of a solution
     return focal_left * (y2 * z1 - y1 * z2) * (1 / (z1 * z2))
 
 

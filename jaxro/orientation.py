@@ -131,6 +131,7 @@ def orient(
 DEFAULTS = {
     name: option.default for name, option in signature(orient).parameters.items() if option.kind is option.KEYWORD_ONLY
 }
+"""What `orient` takes for the options it is not given."""
 
 NEAR_STEPS = 10
 """Steps allowed from the vertical without a loss: near-vertical photos take four or five."""
@@ -182,8 +183,9 @@ def _inspected(
         max_steps=max_steps,
     )
     solved = adjustment.parameters
-    inspected = inspect(pair, to_pose(solved))
-    pose, flipped = _facing(to_pose(solved), inspected, isinstance(solved, RelativePose))
+    pose = to_pose(solved)
+    inspected = inspect(pair, pose)
+    pose, flipped = _facing(pose, inspected, isinstance(solved, RelativePose))
     length = _length(pair, elements, base, pose)
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
