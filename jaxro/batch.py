@@ -83,7 +83,7 @@ def orient_batch(
     if rest.size:
         left_over = jax.tree.map(lambda a: a[rest], host)
         again = oriented(left_over, options | {"start": start.general}, Way(threads, chunk or GENERAL), unheard)
-        _replace(out, rest, again)
+        out = _replaced(out, rest, again)
     return _finish(out)
 
 
@@ -120,9 +120,15 @@ def oriented_near(
     return spread(pairs, program, way, chunk, report)
 
 
-def _replace(out: PyTree, rows: np.ndarray, new: PyTree) -> None:
-    for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(new), strict=True):
+def _replaced(out: PyTree, rows: np.ndarray, new: PyTree) -> PyTree:
+    """The arrays with these rows new; in place but for those that are the program's own."""
+
+    def one(target: np.ndarray, source: np.ndarray) -> np.ndarray:
+        target = target if target.flags.writeable else target.copy()
         target[rows] = source
+        return target
+
+    return jax.tree.map(one, out, new)
 
 
 def clean_batch(
@@ -144,9 +150,8 @@ def clean_batch(
     for stage in others:
         rest = np.flatnonzero(again)
         if rest.size:
-            new, doubtful = decided(jax.tree.map(lambda a, rest=rest: a[rest], host), stage, select, way, unheard)
-            _replace(out, rest, new)
-            again[rest] = doubtful
+            left_over = jax.tree.map(lambda a, rest=rest: a[rest], host)
+            out, again = _replaced((out, again), rest, decided(left_over, stage, select, way, unheard))
     return _finish(out)
 
 
