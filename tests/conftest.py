@@ -1,6 +1,8 @@
 """Strict settings for every test, shapes checked at run time, and the folder of measured data."""
 
+import atexit
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -14,14 +16,17 @@ os.environ["JAXRO_CACHE"] = ""  # no test finds what another one left
 # most of the time goes into compiling programs that run once
 cheap = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {cheap}".strip()
+# what several tests, or processes they start, compile is compiled once; given a size, JAX locks the folder to write
+if "PYTEST_XDIST_WORKER" not in os.environ:  # the process that starts the others, and with which the folder goes
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxro-tests-")
+    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(1 << 34)
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
 
 import jax  # noqa: E402
 
 import jaxro  # noqa: E402, F401  (64 bit)
 
-# programs that several tests compile are compiled once; the folder goes with the run
-jax.config.update("jax_compilation_cache_dir", tempfile.mkdtemp(prefix="jaxro-tests-"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

@@ -198,7 +198,7 @@ def test_jit_is_eager(system, residual):
 @heavy_kind
 def test_vmap_is_a_loop(system, residual):
     pairs = [problems.tilted(seed=seed) for seed in range(4)]
-    together = eqx.filter_vmap(lambda p: oriented(p, system, residual=residual))(stack(pairs))
+    together = problems.jit(jax.vmap(lambda p: oriented(p, system, residual=residual)))(stack(pairs))
     batch = orient_batch(stack(pairs), elements=system, base=BASE, residual=residual, start=starts.Vertical())
     for i, measured in enumerate(pairs):
         alone = oriented(measured, system, residual=residual)
