@@ -48,7 +48,8 @@ def unheard(done: int, total: int) -> None:
 def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = unheard) -> PyTree:
     """run(data) of everything on the leading axis, slab by slab, as NumPy arrays; `chunk` divides a slab.
 
-    What the last slab lacks are zeros: empty pairs. `report` is called from the calling thread.
+    What the last slab lacks are zeros: empty pairs. `report` is called from the calling thread. Where the way gives the
+    pairs per call, which then are parts of something larger, the arrays are the caller's to write to.
     """
     leaves = jax.tree.leaves(data)
     total, points = leaves[0].shape[0], math.prod(leaves[0].shape[1:])
@@ -71,7 +72,7 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
         with jax.default_device(devices[begin // size % len(devices)]):
             return run(slab)
 
-    if total <= size:  # nothing to put together: the program's own arrays, read-only
+    if way.slab is None and total <= size:  # nothing to put together: the program's own arrays, read-only
         out = jax.tree.map(lambda a: np.asarray(a)[:total], part(0))
         report(total, total)
         return out
@@ -90,7 +91,7 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
 
     work = lambda begin: store(begin, part(begin) if first is None or begin else first)
     done = 0
-    if workers == 1:
+    if len(begins) == 1 or workers == 1:
         for begin in begins:
             done += work(begin)
             report(done, total)

@@ -11,7 +11,7 @@ import jaxro
 from jaxro import Pair, ragged, simulation
 from jaxro.rejection import PROCEDURES
 
-LENGTHS = [6, 9, 3, 12, 9, 5, 8, 12, 7, 9]
+LENGTHS = [6, 9, 3, 12, 9, 5, 8, 7, 12, 9]
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +53,16 @@ def test_ragged_equals_one_by_one(pairs, together):
             )
             for name in ("parallax", "residuals", "redundancy"):
                 np.testing.assert_allclose(getattr(found, name)[rows], getattr(alone, name)[: LENGTHS[i]], atol=1e-11)
+
+
+def test_pairs_of_one_length_need_no_order(pairs):
+    """Kept as they come from the program, with those of any position put in their place."""
+    even = [jax.tree.map(lambda a: a[:8] if np.ndim(a) else a, pair) for pair in (pairs[i] for i in (3, 1, 8, 9))]
+    found = ragged.orient_ragged(ragged.join(even), plan=ragged.Plan((8,), (4,), (12,)))
+    both = ragged.orient_ragged(ragged.join([*even, pairs[3]]), plan=PLAN)  # a shorter one: in another way
+    assert np.all(found.usable)
+    np.testing.assert_allclose(found.pose.qw, both.pose.qw[:4], atol=1e-12)
+    np.testing.assert_allclose(found.parallax, both.parallax[: 4 * 8], atol=1e-11)
 
 
 def test_cleaning_equals_one_by_one(pairs, together):
