@@ -1,6 +1,7 @@
 """Strict settings for every test, shapes checked at run time, and the folder of measured data."""
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
@@ -29,6 +30,13 @@ import jaxro  # noqa: E402, F401  (64 bit)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def kept():
+    """What JAX keeps of the programs of a module is not looked through again at every collection."""
+    yield
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
