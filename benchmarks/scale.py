@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import jaxro
 from jaxro import ragged
 from jaxro.io import parquet
+from jaxro.padding import planned
 
 from .common import Size, pair_of, rate
 from .metrics import Metric, median_seconds
@@ -122,7 +123,7 @@ def lengths(size: Size) -> list[Metric]:
         *(np.ones(one[0].size, t) for t in (float, bool)),
         *focals,
     )
-    plan = ragged.planned(np.tile(drawn, 64), 64)  # as of a part of a long table
+    plan = planned(np.tile(drawn, 64), 64)  # as of a part of a long table
     calls = {"uneven": partial(ragged.orient_ragged, uneven, plan=plan), "even": partial(ragged.orient_ragged, even)}
     found = calls["uneven"]()
     calls["even"]()

@@ -14,21 +14,10 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from .batch import GENERAL, Report, Way, decided, oriented, oriented_near, settled, stages, unheard
 from .orientation import Orientation
-from .pairs import Pair, pair
+from .padding import Plan, planned
+from .pairs import Pair, double, pair
 from .rejection import AbstractProcedure, Rejection
 from .starts import AbstractStart, Auto
-
-SIZES = 8
-"""Sizes to which pairs are padded at most: each is another program to compile."""
-
-FEWER = 3
-"""The same where a program takes longer to compile: general starts, searches for wrong points."""
-
-CHEAP = 250_000
-"""Padded points that take less time to calculate than it takes to load another program."""
-
-SHORTEST = 8
-"""The smallest size."""
 
 LONG = 64
 """Points from which values are moved quicker pair by pair than all together."""
@@ -53,11 +42,6 @@ class Ragged(NamedTuple):
     def lengths(self) -> Int[np.ndarray, " pair"]:
         """Points of every pair."""
         return np.diff(self.begins)
-
-    @property
-    def even(self) -> bool:
-        """Whether all pairs have as many points, so that they are a batch already (of sizes from 8 on)."""
-        return bool(len(self.begins) > 1 and np.all(self.lengths == max(self.lengths[0], SHORTEST)))
 
     def padded(self, members: Int[np.ndarray, " some"], size: int) -> Pair:
         """These pairs as one batch, in NumPy. What stands behind a shorter one up to `size` points is masked out."""
@@ -102,6 +86,8 @@ def join(pairs: Sequence[Pair]) -> Ragged:
     """Single pairs of any lengths as one `Ragged`. Raises ValueError for none."""
     if not pairs:
         raise ValueError("join: no pairs given")
+    if any(one.x_left.ndim != 1 for one in pairs):
+        raise ValueError("join: single pairs are wanted, got a batch (pair, point): take it apart with unstack")
     begins = np.cumsum([0] + [one.x_left.shape[-1] for one in pairs])
     fields = {name: [np.asarray(getattr(one, name)) for one in pairs] for name in Ragged._fields[1:]}
     return Ragged(
@@ -109,57 +95,11 @@ def join(pairs: Sequence[Pair]) -> Ragged:
     )
 
 
-def steps(longest: int) -> Int[np.ndarray, " some"]:
-    """The sizes there are to choose from, 8, 10, 12, 14, 16, 20, ...: the same for every table, so that programs that
-    were compiled for one serve others."""
-    return np.array([(4 + quarter) << k for k in range(1, max(longest, SHORTEST).bit_length()) for quarter in range(4)])
-
-
-def sizes(lengths: Int[np.ndarray, " pair"], most: int = SIZES) -> tuple[int, ...]:
-    """The at most `most` of all `steps` with the least padding, found by dynamic programming; a size more only where it
-    saves more than it costs."""
-    if not len(lengths):
-        return (SHORTEST,)
-    known = steps(int(np.max(lengths)))
-    counts = np.bincount(np.searchsorted(known, lengths), minlength=len(known))
-    known, counts = known[: np.flatnonzero(counts)[-1] + 1], counts[: np.flatnonzero(counts)[-1] + 1]
-    below = np.concatenate([[0], np.cumsum(counts)])  # pairs up to each step
-    cost = np.where(np.arange(len(below)) == 0, 0.0, np.inf)  # of all pairs up to a step, with the sizes so far
-    choices, best = [], (np.inf, 0)
-    for k in range(most):
-        whole = cost[None, :] + known[:, None] * (below[1:, None] - below[None, :])
-        whole[np.arange(len(below))[None, :] > np.arange(len(known))[:, None]] = np.inf
-        choices.append(np.argmin(whole, axis=1))
-        cost = np.concatenate([[np.inf], np.min(whole, axis=1)])
-        best = min(best, (cost[-1] + CHEAP * k, k))
-    end, out = len(known), []
-    for choice in reversed(choices[: best[1] + 1]):
-        out.append(int(known[end - 1]))
-        end = int(choice[end - 1])
-    return tuple(reversed(out))
-
-
-class Plan(NamedTuple):
-    """Sizes to pad to, ascending, and the pairs of a call of each program; one plan for many parts of one table, so
-    that no part compiles anything."""
-
-    sizes: tuple[int, ...]
-    slabs: tuple[int, ...]
-    fewer: tuple[int, ...]
-
-
-CALL_POINTS = tuple(1 << bits for bits in (17, 15, 13))
-"""Points per call of a program: few choices, so that programs that were compiled for one table serve others."""
-
-
-def planned(lengths: Int[np.ndarray, " pair"], parts: int = 1) -> Plan:
-    """A plan for pairs of these lengths that come in so many parts of about the same kind."""
-    chosen = sizes(lengths)
-    members = np.bincount(np.searchsorted(chosen, lengths), minlength=len(chosen)) / parts
-    # a call holds a third of the pairs of a part at most: what the last one is filled up with is not much
-    fits = lambda size, own: next((c for c in CALL_POINTS if c * 3 <= own * size), CALL_POINTS[-1])
-    slabs = tuple(max(1, fits(size, own) // size) for size, own in zip(chosen, members, strict=True))
-    return Plan(chosen, slabs, sizes(lengths, FEWER))
+def checked(pairs: Ragged) -> Ragged:
+    """The pairs in double precision. Raises ValueError where there are none."""
+    if len(pairs.begins) < 2:
+        raise ValueError("no pairs: `begins` has to hold the first row of every pair and the end of the last")
+    return double(pairs)
 
 
 PER_POINT = ("parallax", "residuals", "redundancy", "model", "in_front")
@@ -189,8 +129,9 @@ def orient_ragged(
     `read(pair, orientation)`: what is wanted instead, of the pair and of every point; the result then is these two.
     Other keywords are those of `orient`. The results are those of `orient` one by one, to rounding.
     """
+    pairs = checked(pairs)
     plan = plan or planned(pairs.lengths)
-    options = settled(pairs.x_left.dtype, options) | {"read": read, "start": start}
+    options = settled(options) | {"read": read, "start": start}
     out = _Out(pairs, progress)
     rest = [np.zeros(0, int)]
     batches = _batches(pairs, plan.sizes, plan.slabs, threads)
@@ -244,6 +185,7 @@ def clean_ragged(
 
     `select(rejection)`: what is wanted instead, of the pair and of every point; the result then is these two.
     """
+    pairs = checked(pairs)
     plan = plan or planned(pairs.lengths)
     out = _Out(pairs, progress)
     every = stages(procedure, max(plan.sizes))
@@ -304,7 +246,9 @@ class _Out:
 
     def store(self, members: np.ndarray, found: tuple[PyTree, PyTree]) -> None:
         """The values of these pairs, and of their points in the rows of all."""
-        if len(members) == len(self._pairs.lengths) and self._pairs.even:  # nothing to put in order
+        padded = [a.shape[1] for a in jax.tree.leaves(found[1])]
+        if len(members) == len(self._pairs.lengths) and np.all(self._pairs.lengths == max(padded, default=0)):
+            # nothing to put in order
             self.tree = found[0], jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), found[1])
             return
         if self.tree is None:

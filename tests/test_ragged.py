@@ -8,7 +8,7 @@ import problems
 import pytest
 
 import jaxro
-from jaxro import Pair, ragged, simulation
+from jaxro import Pair, padding, ragged, simulation
 from jaxro.rejection import PROCEDURES
 
 LENGTHS = [6, 9, 3, 12, 9, 5, 8, 7, 12, 9]
@@ -33,7 +33,7 @@ def together(pairs):
     return ragged.join(pairs)
 
 
-PLAN = ragged.Plan((8, 12), (4, 4), (12,))
+PLAN = padding.Plan((8, 12), (4, 4), (12,))
 
 
 def test_ragged_equals_one_by_one(pairs, together):
@@ -55,14 +55,28 @@ def test_ragged_equals_one_by_one(pairs, together):
                 np.testing.assert_allclose(getattr(found, name)[rows], getattr(alone, name)[: LENGTHS[i]], atol=1e-11)
 
 
-def test_pairs_of_one_length_need_no_order(pairs):
-    """Kept as they come from the program, with those of any position put in their place."""
-    even = [jax.tree.map(lambda a: a[:8] if np.ndim(a) else a, pair) for pair in (pairs[i] for i in (3, 1, 8, 9))]
-    found = ragged.orient_ragged(ragged.join(even), plan=ragged.Plan((8,), (4,), (12,)))
-    both = ragged.orient_ragged(ragged.join([*even, pairs[3]]), plan=PLAN)  # a shorter one: in another way
-    assert np.all(found.usable)
+@pytest.mark.parametrize(("length", "size"), [(8, 8), (7, 8), (8, 12)])
+def test_pairs_of_one_length(pairs, length, size):
+    """One of them in any position; where they have the size of a batch there is nothing to put in order."""
+    even = [jax.tree.map(lambda a: a[:length] if np.ndim(a) else a, pair) for pair in (pairs[i] for i in (3, 1, 8, 9))]
+    found = ragged.orient_ragged(ragged.join(even), plan=padding.Plan((size,), (4,), (12,)))
+    both = ragged.orient_ragged(ragged.join([*even, pairs[6]]), plan=PLAN)  # with another one: in another way
+    assert np.all(found.usable) and len(found.parallax) == 4 * length
     np.testing.assert_allclose(found.pose.qw, both.pose.qw[:4], atol=1e-12)
-    np.testing.assert_allclose(found.parallax, both.parallax[: 4 * 8], atol=1e-11)
+    np.testing.assert_allclose(found.parallax, both.parallax[: 4 * length], atol=1e-11)
+    kept = ragged.clean_ragged(
+        ragged.join(even), PROCEDURES["three-sigma"], plan=padding.Plan((size,), (4,), (12,))
+    ).kept
+    assert kept.shape == (4 * length,)
+
+
+def test_what_is_no_list_of_pairs_is_refused(pairs):
+    with pytest.raises(ValueError, match="single pairs are wanted"):
+        ragged.join([jaxro.stack([jax.tree.map(jax.numpy.asarray, one) for one in pairs])])
+    nothing = ragged.Ragged(np.zeros(1, int), *np.zeros((5, 0)), np.zeros(0, bool), np.zeros(0), np.zeros(0))
+    for call in (ragged.orient_ragged, lambda none: ragged.clean_ragged(none, PROCEDURES["tau"])):
+        with pytest.raises(ValueError, match="no pairs"):
+            call(nothing)
 
 
 def test_cleaning_equals_one_by_one(pairs, together):
@@ -79,21 +93,21 @@ def test_cleaning_equals_one_by_one(pairs, together):
 @pytest.mark.parametrize("longest", [2_000, 10_000])
 def test_padding_of_any_lengths_stays_under_a_quarter(longest):
     lengths = np.exp(np.random.default_rng(0).uniform(np.log(5), np.log(longest), 100_000)).astype(int)
-    sizes = np.array(ragged.sizes(lengths))
+    sizes = np.array(padding.sizes(lengths))
     padded = sizes[np.searchsorted(sizes, lengths)]
-    assert len(sizes) <= ragged.SIZES and np.all(padded >= lengths)
+    assert len(sizes) <= padding.SIZES and np.all(padded >= lengths)
     assert 1 - lengths.sum() / padded.sum() < 0.25
 
 
 def test_sizes_have_the_least_padding():
     rng = np.random.default_rng(1)
     lengths = rng.choice([8, 11, 14, 20, 33, 50, 64, 90], 500_000, p=rng.dirichlet(np.ones(8)))
-    known = [size for size in ragged.steps(90) if size <= 96]
+    known = [size for size in padding.steps(90) if size <= 96]
 
     def cost(sizes):
-        return np.sum(np.array(sizes)[np.searchsorted(sizes, lengths)]) + ragged.CHEAP * (len(sizes) - 1)
+        return np.sum(np.array(sizes)[np.searchsorted(sizes, lengths)]) + padding.CHEAP * (len(sizes) - 1)
 
     every = [(*some, 96) for k in range(3) for some in combinations(known[:-1], k)]
-    assert cost(ragged.sizes(lengths, 3)) == min(map(cost, every))
-    assert ragged.sizes(np.array([6, 7, 20])) == (20,)
-    assert ragged.sizes(np.zeros(0, int)) == (8,)
+    assert cost(padding.sizes(lengths, 3)) == min(map(cost, every))
+    assert padding.sizes(np.array([6, 7, 20])) == (20,)
+    assert padding.sizes(np.zeros(0, int)) == (8,)

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from ..padding import sizes
 from ..pairs import Pair
-from ..ragged import sizes
 
 
 def each(
@@ -41,7 +41,7 @@ def each(
 
 
 def buckets(lengths: list[int]) -> dict[int, list[int]]:
-    """Indices of the pairs to be padded to each of `ragged.sizes`."""
+    """Indices of the pairs to be padded to each of `padding.sizes`."""
     known = np.asarray(lengths, int)
     chosen = sizes(known)
     place = np.searchsorted(chosen, known)
