@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .orientation import Orientation, orient, orient_near
-from .pairs import Pair
+from .pairs import Pair, double
 from .programs import FAST, WIDE, Program, whole
 from .rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
 from .rejection.hypotheses import AbstractHypotheses
@@ -68,14 +68,14 @@ def orient_batch(
     `select` picks what to keep of each orientation, and XLA computes nothing else: `lambda o: o.pose` is a bare solve.
     `read`, in its place, makes of a pair and its orientation whatever is wanted, in the same compiled program:
     `lambda pair, o: assess(pair, o, sigma0=0.01)`. A function object is compiled once.
-    `progress(done, total)` is called from the calling thread. Other keywords are those of `orient`. The results are
-    those of `orient` one by one, to rounding. Up to 256 MB of results that nobody holds any more are kept as memory for
-    the next ones.
+    `progress(done, total)` is called from the calling thread. `threads` (all cores) and `chunk`, pairs that are worked
+    on together, are chosen if not given. Other keywords are those of `orient`. The results are those of `orient` one by
+    one, to rounding. Up to 256 MB of results that nobody holds any more are kept as memory for the next ones.
     """
     if read is not None and select is not _everything:
         raise ValueError("select and read exclude each other; read sees the orientation, too")
-    host, report, way = jax.tree.map(np.asarray, pairs), progress or unheard, Way(threads, chunk)
-    options = settled(pairs.x_left.dtype, options) | {"read": Selected(select) if read is None else read}
+    host, report, way = jax.tree.map(np.asarray, double(pairs)), progress or unheard, Way(threads, chunk)
+    options = settled(options) | {"read": Selected(select) if read is None else read}
     if not isinstance(start, Auto):
         return _finish(oriented(host, options | {"start": start}, way, report))
     out, fits = oriented_near(host, options | {"start": start}, way, report)
@@ -87,11 +87,11 @@ def orient_batch(
     return _finish(out)
 
 
-def settled(dtype: Any, options: dict[str, Any]) -> dict[str, Any]:
+def settled(options: dict[str, Any]) -> dict[str, Any]:
     """The options of `orient`, a given base as an array: an argument, no program for each value."""
     if options.get("base") is None:
         return options
-    return options | {"base": jnp.asarray(options["base"], dtype)}
+    return options | {"base": jnp.asarray(options["base"], float)}
 
 
 def oriented(
@@ -144,7 +144,7 @@ def clean_batch(
 
     `select=lambda r: r.mask` computes no log and no statistics that the decision does not need.
     """
-    host, report, way = jax.tree.map(np.asarray, pairs), progress or unheard, Way(threads, chunk)
+    host, report, way = jax.tree.map(np.asarray, double(pairs)), progress or unheard, Way(threads, chunk)
     first, *others = stages(procedure, pairs.x_left.shape[-1])
     out, again = decided(host, first, select, way, report)
     for stage in others:
@@ -184,7 +184,8 @@ def map_batch(
     """Any function of one pair, of every pair of a batch and on all cores; keywords as of `orient_batch`.
 
     For procedures and studies of one's own: `map_batch(lambda pair: orient(pair, loss=Huber()).m_q, pairs)`. A function
-    object is compiled once.
+    object is compiled once. It should not use LAPACK (`jnp.linalg`): calls of it from several threads can wait for one
+    another for ever; `threads=1` avoids that.
     """
     chunk = _chunk(pairs, chunk)
     program = Program(_slab_mapped, {"function": function, "chunk": chunk}, _settings(pairs))

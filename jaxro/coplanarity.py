@@ -49,6 +49,11 @@ def fundamental_matrix(rotation: Matrix, base: Vector, focal_left: Scalar, focal
     )
 
 
+def common_focal(focal_left: Scalar, focal_right: Scalar) -> Scalar:
+    """f with 2 / f² = 1 / f1² + 1 / f2²: sigma / f is the standard deviation of directions in the mean of both."""
+    return jnp.sqrt(2 / (1 / focal_left**2 + 1 / focal_right**2))
+
+
 def condition(f: Matrix, point: Point) -> Scalar:
     """g of one point, from the fundamental matrix of the pair."""
     x1, y1, x2, y2 = point

@@ -111,6 +111,7 @@ def sighted_difference(station: Station, first: Sight, second: Sight) -> Number:
 
 
 def _over(a: ArrayLike, b: ArrayLike) -> Number:
-    """a / b, 0 where b is 0: padding, whose numbers are all 0, has height 0."""
-    there = jnp.asarray(b) != 0
-    return jnp.where(there, a / jnp.where(there, jnp.asarray(b, float), 1.0), 0.0)
+    """a / b, but 0 / 0 = 0: padding, whose numbers are all 0, has height 0."""
+    a, b = jnp.asarray(a, float), jnp.asarray(b, float)
+    there = b != 0
+    return jnp.where(there, a / jnp.where(there, b, 1.0), jnp.where(a == 0, 0.0, jnp.copysign(jnp.inf, a)))

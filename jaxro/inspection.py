@@ -1,8 +1,8 @@
 """What one pass over the points tells of a pose.
 
-On which side of the photos the points lie, how far they are from the condition, and how far apart their rays are:
-asked one after the other, each from points read once more, the first two took a quarter of the time of a pose of many
-points. Sums that nobody asks for the compiler leaves out.
+On which side of the photos the points lie, how far they are from the condition, and how far apart their rays are.
+Computing the first two separately took a quarter of the time of a pose of many points. The compiler leaves out sums
+that nobody asks for.
 """
 
 from typing import NamedTuple
@@ -19,12 +19,14 @@ from .reductions import sums
 
 class Inspection(NamedTuple):
     """`in_front`: Σ of the signs of both depths, negative where the base points to the wrong side. `distance`: root
-    mean square distance of the points from the condition, to first order, over the left focal length. `angle`: root
-    mean square sine of the angle between p1 and R p2, that is without a base; `parallax`: the same in units of the
-    standard deviation of a coordinate seen from the photo, sigma / f."""
+    mean square distance of the points from the condition, to first order, over the left focal length. `spread`: that of
+    the left points from the principal point, over the same. `angle`: root mean square sine of the angle between p1 and
+    R p2, that is without a base; `parallax`: the same in units of the standard deviation of a coordinate seen from the
+    photos, sigma / f."""
 
     in_front: Float[Array, ""]
     distance: Float[Array, ""]
+    spread: Float[Array, ""]
     angle: Float[Array, ""]
     parallax: Float[Array, ""]
 
@@ -34,15 +36,19 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
     rotation, base = pose.relative()
     focals = pair.focal_left, pair.focal_right
     f = coplanarity.fundamental_matrix(rotation, base, *focals)
+    seen = coplanarity.common_focal(*focals)
 
     def one(point, sigma, use):
         first, second, w2, *depths = coplanarity.rays(None, rotation, base, point, *focals)
         left, right = (jnp.where(depth > 0, 1.0, -1.0) for depth in depths)
         g, square, _ = coplanarity.linearised(f, point, use)
-        ratio = w2 / (rot.dot(first, first) * rot.dot(second, second) * sigma**2)
-        terms = left + right, g * g / square, ratio * sigma**2, ratio * pair.focal_left**2
+        length = rot.dot(first, first)
+        ratio = w2 / (length * rot.dot(second, second) * sigma**2)
+        radius = length - pair.focal_left**2
+        terms = left + right, g * g / square, radius, ratio * sigma**2, ratio * seen**2
         return tuple(jnp.where(use, term, 0.0) for term in terms)
 
     in_front, *squares = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
-    distance, angle, parallax = (jnp.sqrt(square / jnp.maximum(pair.count, 1.0)) for square in squares)
-    return Inspection(in_front, distance / pair.focal_left, angle, parallax)
+    mean = lambda square: jnp.sqrt(jnp.maximum(square, 0.0) / jnp.maximum(pair.count, 1.0))
+    distance, spread, angle, parallax = map(mean, squares)
+    return Inspection(in_front, distance / pair.focal_left, spread / pair.focal_left, angle, parallax)

@@ -18,7 +18,7 @@ from .inspection import Inspection, inspect
 from .losses import AbstractLoss
 from .model_points import model_points
 from .normal_equations import GaussNewton
-from .pairs import Coordinates, Pair, cleaned
+from .pairs import Coordinates, Pair, cleaned, double
 from .programs import FAST, QUICK, Program, loops, traced
 from .reductions import count, total
 from .results import RESULTS, is_usable
@@ -104,22 +104,24 @@ def orient(
     """Orient the right photo of a pair to the left one by least squares (or a robust loss).
 
     `elements`: the system of the result. `base`: bx of `DependentElements` (its sign says on which side the right photo
-    lies), b of `IndependentElements`; the mean x-parallax if not given. `RelativePose` has a unit base. `residual`:
-    `coplanarity.rigorous` or `coplanarity.parallax`. `start`: an object of `starts`, or known elements, which are then
-    also the parameters that are iterated. `max_steps`: 30 if not given, 300 with a loss, whose reweighted steps
-    converge linearly. Works under jit, vmap and grad; failures are values of `result`.
+    lies), b of `IndependentElements`; if not given bx of a known start, or the mean x-parallax. `RelativePose` has a
+    unit base whatever is given. `residual`: `coplanarity.rigorous` or `coplanarity.parallax`. `start`: an object of
+    `starts`, or known elements, which are then also the parameters that are iterated. `max_steps`: 30 if not given, 300
+    with a loss, whose reweighted steps converge linearly. Works under jit, vmap and grad; failures are values of
+    `result`.
     """
     if pair.x_left.ndim != 1:
         raise ValueError(
             f"orient takes one pair, but the coordinates have shape {pair.x_left.shape}: "
             "use jax.vmap(orient), or orient_batch"
         )
-    base = None if base is None else jnp.asarray(base, pair.x_left.dtype)
+    pair = double(pair)
+    base = None if base is None else jnp.asarray(base, float)
     max_steps = _most(max_steps, loss)
     options = dict(elements=elements, base=base, residual=residual, loss=loss, solver=solver, max_steps=max_steps)
     if traced((pair, base, start)):
         return _orient(pair, start=start, **options)
-    kernel = loops if solver is None else None
+    kernel = loops if solver is None and pair.x_left.size else None  # the compiler does not survive one of no points
     run = lambda function, start: Program(function, options | {"start": start}, QUICK, kernel=kernel)(pair)
     if not isinstance(start, starts.Auto):
         return run(_orient, start)
@@ -163,7 +165,10 @@ def _inspected(
     """The orientation, and what its pose looks like from the points."""
     pair, bad_input = cleaned(pair)
     if isinstance(start, AbstractElements):
-        begin = starts.Begin(start, jnp.asarray(False), jnp.asarray(False))
+        known = jax.tree.map(lambda element: jnp.asarray(element, pair.x_left.dtype), start)
+        begin = starts.Begin(known, jnp.asarray(False), jnp.asarray(False))
+        if base is None and elements is DependentElements and isinstance(known, DependentElements):
+            base = lax.stop_gradient(known.bx)
     else:
         begin = start(lax.stop_gradient(pair))  # the optimum does not depend on where it is sought
     prepare, condition, observations, cofactor = residual(pair)
@@ -211,7 +216,7 @@ def _inspected(
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous, RESULTS.two_solutions),
         (count(pair.mask & ~in_front & ~far) > 0, RESULTS.points_behind_camera),
-        (_undefined(elements, pose), RESULTS.elements_undefined),
+        (_undefined(elements, pose, length), RESULTS.elements_undefined),
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
         ((noise**2 * worst > WEAK**2) | (margin < needed * noise), RESULTS.weakly_determined),
     ):
@@ -275,7 +280,7 @@ def _scale(chosen: AbstractElements, pose: RelativePose, length):
 
 def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractElements], length):
     """The elements in the chosen system and their cofactors J Q Jᵀ."""
-    if type(solved) is system and system is not RelativePose:
+    if type(solved) is system and system is IndependentElements:
         return solved, cofactor
     sign = jnp.where(flipped, -1.0, 1.0)
 
@@ -285,20 +290,22 @@ def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractEl
         return convert(RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *base), system, length)
 
     origin = (jnp.zeros_like(length),) * 5
-    if system is RelativePose:
-        return at(origin), cofactor
+    if system is RelativePose:  # `tangents` of -b are those of b, the second one turned: b1 changes its sign
+        one = jnp.ones_like(sign)
+        signs = jnp.stack([one, one, one, sign, one])
+        return at(origin), cofactor * signs[:, None] * signs[None, :]
     push = jax.linearize(lambda *x: jnp.stack(at(x).values()), *origin)[1]
     jacobian = jax.vmap(push, out_axes=1)(*jnp.eye(5, dtype=cofactor.dtype))
     right = jnp.sum(jacobian[:, :, None] * cofactor[None, :, :], axis=1)
     return at(origin), jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
 
 
-def _undefined(system: type[AbstractElements], pose: RelativePose) -> Bool[Array, ""]:
-    """Whether the named elements do not exist at this pose."""
+def _undefined(system: type[AbstractElements], pose: RelativePose, length) -> Bool[Array, ""]:
+    """Whether the named elements do not exist at this pose, or not with this base."""
     if system is DependentElements:
-        return jnp.abs(pose.bx) < 1e-6
+        return (jnp.abs(pose.bx) < 1e-6) | ~(jnp.isfinite(length) & (length != 0))
     if system is IndependentElements:
-        return rot.length(pose.bx, pose.by) < 1e-6
+        return (rot.length(pose.bx, pose.by) < 1e-6) | ~(jnp.isfinite(length) & (length > 0))
     return jnp.zeros_like(pose.bx, bool)
 
 

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .reductions import count, total
 
@@ -87,7 +87,7 @@ def pair(
     x_right: Values,
     y_right: Values,
     *,
-    focal: ArrayLike | tuple[ArrayLike, ArrayLike],
+    focal: ArrayLike | Sequence,
     sigma: Values | None = None,
     weight: Values | None = None,
     mask: Values | None = None,
@@ -115,9 +115,22 @@ def pair(
             deviation = deviation / jnp.sqrt(jnp.where(relative == 0, 1.0, relative))
     except ValueError as error:
         raise ValueError(f"pair: mask, sigma and weight must fit the coordinates' shape {shape}: {error}") from None
-    left, right = focal if isinstance(focal, tuple) else (focal, focal)
+    left, right = focal if isinstance(focal, tuple | list) else (focal, focal)
     focals = [jnp.broadcast_to(jnp.asarray(f, dtype), shape[:-1]) for f in (left, right)]
     return Pair(*coordinates, deviation, taking_part, *focals)
+
+
+def double(one: PyTree) -> PyTree:
+    """A `Pair`, or pairs of any form, in double precision, in which everything is adjusted.
+
+    Raises ValueError where JAX has none.
+    """
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError(
+            "jaxro adjusts in double precision, which is switched off in JAX: leave JAX_ENABLE_X64 unset, or call "
+            "jax.config.update('jax_enable_x64', True)"
+        )
+    return jax.tree.map(lambda a: a.astype(float) if a.dtype == np.float32 else a, one)
 
 
 def pad(one: Pair, points: int) -> Pair:
@@ -163,18 +176,28 @@ def swapped(one: Pair) -> Pair:
     )
 
 
+WIDEST = 1e9
+"""Coordinate over focal length from which it is no measurement: its ray is at right angles to the axis."""
+
+SCALE = 1e30
+"""Focal lengths and standard deviations above this or below its inverse are no numbers in any unit: powers of them
+overflow."""
+
+
 def cleaned(one: Pair) -> tuple[Pair, Bool[Array, "*pairs"]]:
-    """The pair with non-finite points masked and zeroed, and whether anything had to be left out.
+    """The pair with points that are not finite masked and zeroed, and whether anything had to be left out.
 
     Masked points are set to zero coordinates and unit sigma whatever they held, so that nothing they hold can reach a
-    result or a derivative.
+    result or a derivative. What is out of all proportion (WIDEST, SCALE) counts as not finite: its squares would not
+    be.
     """
-    finite = (one.sigma > 0) & jnp.isfinite(one.sigma)
-    for c in one.coordinates:
-        finite = finite & jnp.isfinite(c)
-    use = one.mask & finite
+    fair = lambda positive: (positive > 1 / SCALE) & (positive < SCALE)
     focals = [one.focal_left, one.focal_right]
-    focal_ok = [jnp.isfinite(f) & (f > 0) for f in focals]
+    focal_ok = [fair(f) for f in focals]
+    finite = fair(one.sigma)
+    for c, f in zip(one.coordinates, (focals[0], focals[0], focals[1], focals[1]), strict=True):
+        finite = finite & (jnp.abs(c) < WIDEST * jnp.minimum(f, SCALE)[..., None])
+    use = one.mask & finite
     bad = (count(one.mask & ~finite) > 0) | ~focal_ok[0] | ~focal_ok[1]
     repaired = Pair(
         *(jnp.where(use, c, 0.0) for c in one.coordinates),

@@ -1,8 +1,9 @@
 """Compiled programs on disk, so that the next process compiles nothing.
 
 Off unless a caller names a folder (`use`): the command line does, a library call writes nothing. A program is found
-again by everything it depends on: the source of this package, the versions of JAX, the processor, the compiler
-settings, the static options and the shapes. The files are pickles, in a folder that only its owner may write to.
+again by everything it depends on: the source of this package, the versions of those it stands on, the processor, the
+compiler settings, the static options and the shapes. The files are pickles: a folder that everybody may write to, or
+that belongs to somebody else, is not used.
 """
 
 import hashlib
@@ -27,9 +28,17 @@ _folder: Path | None = None
 
 
 def use(folder: Path | None) -> None:
-    """Keep compiled programs in this folder from now on (None: nowhere)."""
+    """Keep compiled programs in this folder from now on (None: nowhere), unless somebody else could write to it."""
     global _folder
-    _folder = folder
+    _folder = folder if folder is not None and _ours(folder) else None
+
+
+def _ours(folder: Path) -> bool:
+    try:
+        there = folder.stat()
+    except OSError:
+        return True  # it will be made
+    return not hasattr(os, "getuid") or (there.st_uid == os.getuid() and not there.st_mode & 0o002)
 
 
 def default_folder() -> Path | None:
@@ -52,7 +61,11 @@ def compiled(function: Callable, settings: dict[str, Any] | None, data: PyTree, 
     """
     leaves, structure = jax.tree.flatten(data)
     shapes = [(a.shape, str(a.dtype)) for a in map(jax.typeof, leaves)]
-    content = pickle.dumps((_surroundings(), settings, shapes, str(structure), key))
+    try:
+        content = pickle.dumps((_surroundings(), settings, shapes, str(structure), key))
+    except (pickle.PicklingError, AttributeError, TypeError):  # a lambda among the options has no name to be found by
+        program = jax.jit(function, compiler_options=settings)
+        return lambda data: program(*data)
     path = (_folder or Path()) / f"{hashlib.sha256(content).hexdigest()}.program"
     stored = _read(path)
     if stored is None:
@@ -116,6 +129,7 @@ def _surroundings() -> tuple:
         processor = next(line for line in lines if line.startswith(("flags", "Features")))
     except (OSError, StopIteration):
         processor = platform.processor()
-    versions = (jax.__version__, version("jaxlib"), platform.python_version())
+    packages = ("jax", "jaxlib", "equinox", "optimistix", "lineax")
+    versions = (*map(version, packages), platform.python_version())
     flags = (os.environ.get("XLA_FLAGS"), jax.dtypes.canonicalize_dtype(float).name, os.cpu_count())
     return source.hexdigest(), platform.machine(), processor, versions, flags

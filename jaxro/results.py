@@ -23,8 +23,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     too_few_points = "Fewer than five usable points: relative orientation has five unknowns. Measure more points."
     non_finite_input = (
-        "A coordinate, standard deviation or focal length is NaN or infinite (or not positive where it must be). "
-        "The point was left out; correct or mask it and orient again."
+        "A coordinate, standard deviation or focal length is NaN, infinite, out of all proportion (a coordinate above "
+        "1e9 focal lengths) or not positive where it must be. The point was left out; correct or mask it and orient "
+        "again."
     )
     rank_deficient = (
         "The layout does not determine the five elements (points on a line, in one zone, or a needed zone is empty). "
@@ -50,7 +51,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     elements_undefined = (
         "The chosen elements do not exist here: the base is at right angles to the x axis (or photo axis) they divide "
-        "by. Use RelativePose, which exists for every position."
+        "by, or the given base is no length: 0, not finite, or negative for IndependentElements. Give another base, or "
+        "use RelativePose, which exists for every position."
     )
     diverged = (
         "The iterations did not converge. Look for gross errors in the coordinates, the focal lengths and the axes "

@@ -27,10 +27,10 @@ ALIGNMENT = 64
 
 
 class Way(NamedTuple):
-    """How pairs go through: threads (all cores), pairs per chunk (by the number of points), and pairs per call of the
-    program (by the number of pairs; given, all calls have one shape), each as it is best where it is None; calls per
-    core at least, so that no thread waits long for the last (0: one call if it may be). The results are the same bits
-    with any number of threads."""
+    """How pairs go through. None picks a good value: of threads (all cores), pairs per chunk (by the number of points)
+    and pairs per call of the program, `slab` (by the number of pairs; if given, every call has this shape). `calls`: at
+    least so many per core, so that no thread waits long for the last one (0: a single call if possible). The results
+    are the same bits with any number of threads."""
 
     threads: int | None = None
     chunk: int | None = None
@@ -48,18 +48,20 @@ def unheard(done: int, total: int) -> None:
 def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = unheard) -> PyTree:
     """run(data) of everything on the leading axis, slab by slab, as NumPy arrays; `chunk` divides a slab.
 
-    What the last slab lacks are zeros: empty pairs. `report` is called from the calling thread. Where the way gives the
-    pairs per call, which then are parts of something larger, the arrays are the caller's to write to.
+    The last slab is filled up with empty pairs (zeros, mask False). `report` is called from the calling thread. If
+    `way.slab` is given, the arrays are writable. Raises ValueError for a chunk or number of threads below one.
     """
+    if chunk < 1 or (way.threads is not None and way.threads < 1):
+        raise ValueError(f"threads and chunk must be positive (or None), got {way.threads} and {chunk}")
     leaves = jax.tree.leaves(data)
     total, points = leaves[0].shape[0], math.prod(leaves[0].shape[1:])
     devices = jax.local_devices()  # several GPUs take turns; a CPU is one, whose cores are the threads
-    cores = max(len(os.sched_getaffinity(0)), 2 * len(devices))
+    cores = max(_cores(), 2 * len(devices))
     workers = way.threads or cores
     if way.slab is not None:
         size = -(-way.slab // chunk) * chunk
     elif total <= chunk:
-        size = 1 << max(total - 1, 0).bit_length()
+        size = min(1 << max(total - 1, 0).bit_length(), chunk)
     else:
         most = max(1, SLAB_POINTS // (chunk * max(points, 1)))
         size = chunk * min(most, _rounded(-(-total // (max(way.calls * cores, 1) * chunk))))
@@ -111,6 +113,11 @@ def chunked(one: Callable, data: PyTree, chunk: int) -> PyTree:
         return jax.vmap(one)(data)
     split = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), data)
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), jax.lax.map(jax.vmap(one), split))
+
+
+def _cores() -> int:
+    """The cores that this process may use; all of the machine where the system does not tell."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _filled(a: np.ndarray, size: int) -> np.ndarray:

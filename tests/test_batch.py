@@ -13,7 +13,7 @@ import problems
 import pytest
 
 import jaxro
-from jaxro import DependentElements, batch, simulation, starts
+from jaxro import DependentElements, batch, program_store, simulation, starts
 from jaxro.memory import LARGE, Memory
 from jaxro.programs import FAST, Program, whole
 
@@ -84,6 +84,34 @@ def test_batch_equals_vmap(pairs, loop, options):
         (batch.parallax / 100, loop.parallax / 100),
     ):
         np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+@pytest.mark.parametrize("chunk", [3, 100])
+def test_any_chunk_will_do(chunk):
+    few = jax.tree.map(lambda a: a[:7], mixed())
+    found = jaxro.orient_batch(few, select=_sigma0, chunk=chunk)
+    np.testing.assert_allclose(found, jaxro.orient_batch(few, select=_sigma0), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("wrong", [{"chunk": 0}, {"threads": 0}, {"threads": -1}])
+def test_what_cannot_be_is_refused(wrong):
+    with pytest.raises(ValueError, match="must be positive"):
+        jaxro.orient_batch(mixed(), select=_sigma0, **wrong)
+
+
+def _sigma0(orientation):
+    return orientation.sigma0
+
+
+def test_programs_of_functions_without_a_name_are_not_kept(tmp_path):
+    """A lambda cannot be found again on disk: it is compiled, and nothing is written."""
+    few = jax.tree.map(lambda a: a[:7], mixed())
+    program_store.use(tmp_path)
+    try:
+        np.testing.assert_array_equal(jaxro.orient_batch(few, select=lambda o: o.sigma0, chunk=3).shape, (7,))
+    finally:
+        program_store.use(None)
+    assert not list(tmp_path.iterdir())
 
 
 def test_only_what_is_selected_and_progress(pairs):

@@ -2,6 +2,7 @@
 
 from functools import lru_cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -156,6 +157,71 @@ def test_plane_has_two_solutions():
     assert name(outcome(photographed(relief, turn=(0.1, -0.2, 0.9), sigma=0.005))) == "successful"
 
 
+def in_any_position(points, count, seed, sigma):
+    """`count` pairs of such points (rng -> (n, 3), in bases): photos in any position, the mean point ahead of both."""
+    rng, pairs, truth = np.random.default_rng(seed), [], []
+    while len(pairs) < count:
+        ground, base = points(rng), rng.normal(size=3)
+        base /= np.linalg.norm(base)
+        turn = rng.uniform(-1, 1, 2) * 0.5, rng.uniform(-np.pi, np.pi)
+        right = (ground - base) @ turned((*turn[0], turn[1])).T
+        if np.all(right[:, 2] < -0.5):
+            both = [-FOCAL * p[:, k] / p[:, 2] for p in (ground, right) for k in (0, 1)]
+            pairs.append(np.array(both) + rng.normal(size=(4, len(ground))) * sigma)
+            truth.append(base)
+    return np.stack(pairs, axis=1), np.stack(truth)
+
+
+@pytest.mark.parametrize("count", [8, 12, 20])
+def test_points_in_a_plane_do_not_say_which_of_two_orientations_is_right(count):
+    """A plane in any position: both fit as well but for chance, so that hardly one is to be taken for certain."""
+
+    def plane(rng):
+        x, y = rng.uniform(-2, 2, (2, count))
+        slope = rng.uniform(-0.6, 0.6, 2)
+        return np.column_stack([x, y, -4 + slope[0] * x + slope[1] * y])
+
+    coordinates, truth = in_any_position(plane, 300, 4, sigma := 0.015)
+    found = jaxro.orient_batch(jaxro.pair(*coordinates, focal=FOCAL, sigma=sigma), start=jaxro.starts.General())
+    base = np.stack([found.pose.bx, found.pose.by, found.pose.bz], axis=1)
+    wrong = np.sum(base * truth, axis=1) < np.cos(0.2)
+    certain = np.asarray(found.result == RESULTS.successful)
+    assert np.sum(wrong & certain) <= 3 and np.mean(found.result == RESULTS.two_solutions) > 0.3
+
+
+def test_points_of_little_accuracy_do_no_harm():
+    """Five of twenty points a thousand times less accurate: as good as without them."""
+    relief = lambda rng: np.column_stack([*rng.uniform(-1, 1, (2, 20)), rng.uniform(-4, -2, 20)])
+    coordinates, truth = in_any_position(relief, 60, 5, 0.0)
+    sigma = np.where(np.arange(20) < 15, 0.003, 3.0)
+    coordinates += np.random.default_rng(6).normal(size=coordinates.shape) * sigma
+    many = lambda mask: jaxro.orient_batch(
+        jaxro.pair(*coordinates, focal=FOCAL, sigma=np.broadcast_to(sigma, coordinates.shape[1:]), mask=mask)
+    )
+    found, without = many(None), many(np.broadcast_to(sigma < 1, coordinates.shape[1:]))
+    assert np.all(without.usable) and np.mean(found.usable) > 0.9
+    assert set(np.asarray(found.result._value)[~np.asarray(found.usable)]) <= {int(RESULTS.points_behind_camera._value)}
+    along = sum(np.asarray(getattr(found.pose, c)) * truth[:, k] for k, c in enumerate(("bx", "by", "bz")))
+    assert np.all(along > np.cos(0.01))
+
+
+def test_a_narrow_angle_does_not_hide_that_the_vertical_was_the_wrong_start():
+    """Twenty points within a twentieth of the focal length: from the vertical there is another minimum, 0.02 mm off."""
+    measured = """
+        1.516 -4.252 3.005 -1.9 -4.621 0.437 -4.11 2.955 1.591 0.077
+        0.08 -4.21 -2.2 1.665 -3.66 4.431 3.853 0.823 -2.29 -1
+        -3.72 -2.172 4.689 -0.317 3.633 4.954 -4.714 1.3 1.485 -1.749
+        3.238 2.241 1.716 2.22 -4.062 3.288 -4.129 4.848 2.727 4.831
+        -0.966 -15.729 -4.255 -6.256 -15.265 -10.746 -18.088 7.227 0.784 -8.527
+        10.068 -14.609 -8.539 -8.96 -17.186 -4.348 11.16 -1.229 -12.059 -9.907
+        4.336 7.314 13.365 8.522 13.518 14.242 4.768 9.057 9.761 7.024
+        11.2 11.954 10.864 11.146 5.375 11.776 2.922 13.547 12.171 14.186
+    """
+    coordinates = np.array(measured.split(), float).reshape(4, 20)
+    found = jaxro.orient(jaxro.pair(*coordinates, focal=100.0, sigma=0.001))
+    assert name(found) == "successful" and found.sigma0 < 1.5 and found.pose.bx < 0
+
+
 def test_point_behind_a_photo():
     points = block(12)
     points[3] *= -1
@@ -201,6 +267,39 @@ def test_nonsense_coordinates_are_not_called_an_orientation():
     rng = np.random.default_rng(8)
     found = outcome(jaxro.pair(*rng.uniform(-100, 100, (4, 20)), focal=FOCAL))
     assert not bool(found.usable)
+
+
+@pytest.mark.parametrize("size", [1e12, 1e160, 1e300])
+def test_numbers_out_of_all_proportion_are_no_measurements(size):
+    """Their squares are infinite, and what is divided by them nothing."""
+    pair = photographed(block())
+    for spoiled in ("x_left", "y_right", "sigma", "focal_right"):
+        value = getattr(pair, spoiled)
+        value = value.at[3].set(size * 1e20) if value.ndim else value * size * 1e20
+        worse = eqx.tree_at(lambda p, spoiled=spoiled: getattr(p, spoiled), pair, value)
+        assert name(outcome(worse)) == "non_finite_input"
+
+
+def test_a_base_that_is_no_length_gives_no_elements():
+    pair = photographed(block())
+    for base in (0.0, np.nan, np.inf):
+        assert name(outcome(pair, elements=DependentElements, base=base)) == "elements_undefined"
+    assert name(outcome(pair, elements=IndependentElements, base=-3.0)) == "elements_undefined"
+
+
+def test_no_points_at_all():
+    assert name(jaxro.orient(jaxro.pair([], [], [], [], focal=1.0))) == "too_few_points"
+
+
+def test_single_precision_is_adjusted_in_double_or_refused():
+    pair = photographed(block(), sigma=0.01)
+    single = jax.tree.map(lambda a: a if a.dtype == bool else a.astype(jnp.float32), pair)
+    found = outcome(single)
+    assert name(found) == "successful" and found.sigma0.dtype == jnp.float64
+    many = jax.tree.map(lambda a: np.asarray(a)[None], single)
+    np.testing.assert_allclose(jaxro.orient_batch(many, select=lambda o: o.sigma0)[0], found.sigma0, rtol=1e-9)
+    with jax.enable_x64(False), pytest.raises(ValueError, match="double precision"):
+        jaxro.orient(single)
 
 
 def test_duplicate_points_do_not_make_a_layout():

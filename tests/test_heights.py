@@ -57,6 +57,11 @@ def test_difference_in_two_squares_is_that_of_heights_and_the_short_forms_are_as
     np.testing.assert_allclose(level, -2.9, atol=0.05)
 
 
+def test_a_point_at_infinity_has_no_height():
+    """p_c + dp = 0: parallel rays."""
+    assert np.isinf(heights.height(1500.0, 5.0, -5.0))
+
+
 def test_padding_is_zero_and_derivatives_are_finite():
     slopes = jax.grad(lambda station, s: heights.sighted_difference(station, s, s).sum(), (0, 1))(
         Station(0.0, 0.0), Sight(Square(0.0, 0.0), 0.0, 0.0)

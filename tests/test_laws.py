@@ -310,6 +310,36 @@ def test_failures_leave_their_neighbours_gradients_alone():
     np.testing.assert_array_equal(clean[:, 1::2], spoilt[:, 1::2])
 
 
+def test_cofactors_do_not_depend_on_which_way_the_base_was_found():
+    """The right photo on the left: from the vertical the base is found the wrong way round, and turned."""
+    measured = jaxro.swapped(problems.dewitt())
+    near, general = (problems.orient(measured, start=start) for start in (jaxro.starts.Auto(), jaxro.starts.General()))
+    assert near.pose.bx < -0.9
+    np.testing.assert_allclose(near.cofactor, general.cofactor, rtol=1e-6, atol=1e-12)
+    of = lambda pose: jnp.stack(jaxro.convert(pose, IndependentElements, jnp.asarray(BASE)).values())
+    propagated = jaxro.propagation.propagate_adjusted(of, near).deviations
+    np.testing.assert_allclose(
+        propagated, problems.orient(measured, elements=IndependentElements).deviations, rtol=1e-6
+    )
+
+
+def test_a_known_start_does_not_change_what_is_given():
+    """Elements, their deviations and the model have one scale: that of the base given, or of the start."""
+    zero = jnp.zeros(())
+    start = DependentElements(*(zero,) * 5, jnp.asarray(50.0))
+    free = problems.orient(problems.dewitt(), elements=DependentElements, base=91.9825)
+    given = problems.orient(problems.dewitt(), elements=DependentElements, base=91.9825, start=start)
+    alone = problems.orient(problems.dewitt(), elements=DependentElements, start=start)
+    for found, scale in ((given, 1.0), (alone, 50 / 91.9825)):
+        lengths = np.array([scale, scale, 1, 1, 1])
+        np.testing.assert_allclose(found.elements.bx, 91.9825 * scale, rtol=1e-12)
+        np.testing.assert_allclose(
+            jnp.stack(found.elements.values()), lengths * jnp.stack(free.elements.values()), rtol=1e-8
+        )
+        np.testing.assert_allclose(found.deviations, lengths * free.deviations, rtol=1e-6)
+        np.testing.assert_allclose(found.model[2], scale * free.model[2], rtol=1e-8)
+
+
 def test_vertical_start_is_enough_for_vertical_photos():
     """Independent elements start from zero and end where the general start ends."""
     measured = problems.tilted()

@@ -1,6 +1,7 @@
 """Every choice of up to k omissions: exact where several errors hide each other."""
 
 from itertools import combinations
+from math import comb
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,9 @@ from ..starts import AbstractStart, Vertical
 from .base import OUTCOMES, AbstractProcedure, Rejection, Round, began, ended, finished, independent, recorded
 from .robust import improved, normalised, scaled
 
+CHOICES = 1 << 18
+"""Choices that are compared at most: their numbers take some 10 MB."""
+
 
 class AllSubsets(AbstractProcedure):
     """Of all choices of at most `most` omissions the fewest that pass the global test, and of these the best.
@@ -26,7 +30,8 @@ class AllSubsets(AbstractProcedure):
     Ω - r_S' (I - H_SS)⁻¹ r_S, H = A N⁻¹ A' (Cook and Weisberg 1982). The best `shortlist` of every number of omissions
     are then solved by `iterations` Gauss-Newton steps. A choice passes if Σ r² is at most the chi-squared value of
     `level` for its n - 5 degrees of freedom. At least `least` points stay. No choice passes: `operator_needed`, and
-    nothing is rejected. There are 2,516 choices of at most four of 16 points, and 14,892 of at most six.
+    nothing is rejected. There are 2,516 choices of at most four of 16 points, and 14,892 of at most six; of many points
+    fewer are left out, so that there are at most CHOICES (four of 50 points, two of 200).
     """
 
     most: int = 4
@@ -41,6 +46,8 @@ class AllSubsets(AbstractProcedure):
         pair = scaled(cleaned(pair)[0], self.sigma)
         n = pair.x_left.shape[0]
         most = min(self.most, max(n - self.least, 0))
+        while sum(comb(n, k) for k in range(most + 1)) > CHOICES:
+            most -= 1
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         used = count(fixed.mask)
         begin = orient(fixed, start=self.start(fixed).pose).pose

@@ -16,7 +16,8 @@ class Auto(AbstractStart):
     """A few Gauss-Newton steps from the vertical; where they fit, that is the start, elsewhere `general`.
 
     "Fit" means: rotation and base within `tilt` (rad) of the normal case and a root mean square distance below
-    `tolerance` times the focal length, far above any measuring error and far below what a wrong orientation leaves.
+    `tolerance` times the focal length, far above any measuring error and far below what a wrong orientation leaves; of
+    photos that see less than a wide angle times their spread, of which it leaves less.
     Of the two solutions of an exactly plane scene this takes the one near the normal case without mention; pass
     `General()` where photos in other positions look at a plane. `steps` count inside a caller's `jit`, where
     the solution ends when the next step would be below 1e-10 instead of 1e-12; alone and in batches all steps from the
@@ -32,7 +33,7 @@ class Auto(AbstractStart):
         """Whether a pose reached from the vertical is near it and explains the points; the base may point backwards."""
         longest = 2 * jnp.maximum(jnp.maximum(jnp.abs(pose.qx), jnp.abs(pose.qy)), jnp.abs(pose.qz))
         longest = jnp.maximum(longest, jnp.maximum(jnp.abs(pose.by), jnp.abs(pose.bz)))
-        return (longest < self.tilt) & (inspected.distance < self.tolerance)
+        return (longest < self.tilt) & (inspected.distance < self.tolerance * jnp.minimum(1.0, 2 * inspected.spread))
 
     def __call__(self, pair: Pair) -> Begin:
         near = approached(pair, vertical(pair.focal_left), self.steps)

@@ -12,11 +12,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .. import rotations as rot
+from ..coplanarity import common_focal
 from ..degeneracy import significant
 from ..elements import RelativePose, vertical
 from ..inspection import inspect
 from ..normal_equations import steps
-from ..pairs import Pair
+from ..pairs import Pair, cleaned, pad
 from .base import AbstractStart, Begin, distances
 from .decomposition import best_pose, cheirality
 from .eight_point import eight_point
@@ -28,6 +29,15 @@ rounding would choose another one in another program."""
 
 BEHIND = 0.25
 """Share of points behind a photo above which a candidate counts as a wrong decomposition."""
+
+CERTAIN = 2.576
+"""Normal quantile, of one in 200, from which the better of two orientations is taken for the right one."""
+
+COARSE = 10.0
+"""Standard deviation, of the weighted mean of all, above which a point does not help to find a start."""
+
+ENOUGH = 10
+"""Points that are enough for a start."""
 
 DIFFERENT = 0.05
 """Angle (rad) between rotations or bases from which two candidates are different orientations."""
@@ -44,6 +54,8 @@ class General(AbstractStart):
     steps: int = 6
 
     def __call__(self, pair: Pair) -> Begin:
+        pair = pad(pair, max(pair.x_left.shape[0], 1))  # of no points there are no candidates to choose from
+        pair = _accurate(pair)
         left, right = vectors(pair)
         poses, real = self._candidates(pair, left, right)
         score = jnp.where(real, _scores(pair, poses, left, right), jnp.inf)
@@ -54,11 +66,11 @@ class General(AbstractStart):
         first, second = (jax.tree.map(lambda a, i=i: a[i], best) for i in (0, 1))
         squares, other = (inspect(pair, pose).distance ** 2 for pose in (first, second))
         freedom = pair.count - 5
-        slack = jnp.where(freedom > 0, 10 / jnp.where(freedom > 0, freedom, 1.0), 0.0)
         ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
-        ambiguous = ambiguous & (other < squares * (1 + slack) + EXACT)
+        ambiguous = ambiguous & (other < squares * _excess(freedom) + EXACT)
         turn, parallax = rotation_only(left, right, pair.mask)
         noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
+        noise = noise * pair.focal_left / common_focal(pair.focal_left, pair.focal_right)
         pure = parallax < significant(freedom) * noise + 1e-9
         pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
         return Begin(pose, ambiguous & ~pure, pure)
@@ -76,6 +88,23 @@ class General(AbstractStart):
         normal_case = jax.tree.map(lambda a: a[None], vertical(pair.focal_left))
         poses = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), poses, normal_case)
         return poses, jnp.concatenate([real, jnp.ones(1, bool)])
+
+
+def _accurate(pair: Pair) -> Pair:
+    """The pair without the points of which a start has nothing to learn, if enough are left."""
+    weight = jnp.where(pair.mask, 1 / pair.sigma**2, 0.0)
+    mean = jnp.sum(weight) / jnp.maximum(pair.count, 1.0)
+    good = pair.mask & (weight * COARSE**2 >= mean)
+    return cleaned(pair.with_mask(jnp.where(jnp.sum(good) >= ENOUGH, good, pair.mask)))[0]
+
+
+def _excess(freedom: Float[Array, ""]) -> Float[Array, ""]:
+    """The ratio of Σ r² of two orientations up to which they are not told apart.
+
+    Where both are right, as they are of points in a plane, it has Fisher's distribution with f = n - 5 degrees of
+    freedom each. Its quantile by his z: ln F is nearly normal with the variance 4 / (f - 1); for f = 1 as it is.
+    """
+    return jnp.where(freedom > 0, jnp.exp(2 * CERTAIN / jnp.sqrt(jnp.maximum(freedom - 1, 0.28))), 1.0)
 
 
 def vectors(pair: Pair) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
