@@ -62,7 +62,7 @@ def orient(
     options = Options(
         file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
     )
-    if given.large(file, parquet, resume):
+    if given.large(file, parquet, resume, tables, engine):
         from .io import large
 
         _end(lambda: large.run(options, large.Large(tables, resume, engine=_engine(engine))))
@@ -122,7 +122,7 @@ def clean(
         file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
     )
     name, changes = procedure or DEFAULT, tolerance or []
-    if given.large(file, parquet, resume):
+    if given.large(file, parquet, resume, tables, engine):
         from .io import large
 
         how = large.Large(tables, resume, engine=_engine(engine))

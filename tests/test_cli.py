@@ -105,7 +105,7 @@ def test_what_could_hide_is_told_and_written(tmp_path):
     told = " ".join(run(file, "--focal", 150, "--sigma", 0.01, "--out", out).output.split())
     pair = jaxro.pair(*coordinates, focal=150.0, sigma=0.01)
     reading = jaxro.assess(pair, jaxro.orient(pair), sigma0=1.0)
-    assert f"Mind: Point p4 has |w| = {abs(float(reading.w[4])):.1f} where 3.29 is allowed" in told
+    assert f"Mind: Point p4 has |w| = {abs(float(reading.w[4])):.2f} where 3.29 is allowed" in told
     assert "times less accurate than their sigma says" in told
     (poor,) = np.flatnonzero(np.asarray(reading.redundancy) < 0.1)
     assert f"Poorly checked (redundancy below 0.1): point p{poor}; an error of" in told
@@ -176,6 +176,8 @@ BAD_OPTIONS = {
     "zero base": ([*FOCAL, "--base", "0", "--elements", "dependent"], "0.0"),
     "unknown elements": ([*FOCAL, "--elements", "absolute"], "absolute"),
     "two cameras": ([*FOCAL, "--camera", "camera.toml"], "beside --camera"),
+    "tables of another kind": ([*FOCAL, "--tables", "points"], "--parquet"),
+    "engine for another kind": ([*FOCAL, "--engine", "ray"], "--parquet"),
     "no camera file": (["--camera", "missing.toml"], "missing.toml"),
 }
 
@@ -205,6 +207,14 @@ def test_results_are_overwritten_only_by_force(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == FILES | {"notes.txt"} and keep.read_text() == "mine"
 
 
+def test_a_result_never_takes_the_place_of_what_was_read(sample, tmp_path):
+    table = tmp_path / "points.csv"
+    table.write_bytes(sample.read_bytes())
+    result = run(table, *FOCAL, "--out", tmp_path, "--force")
+    assert result.exit_code == 2 and "points.csv" in result.stderr
+    assert list(tmp_path.iterdir()) == [table] and table.read_bytes() == sample.read_bytes()
+
+
 def test_nothing_is_left_of_a_result_that_could_not_be_written(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -217,7 +227,7 @@ def test_nothing_is_left_of_a_result_that_could_not_be_written(tmp_path, monkeyp
 def test_kept_programs_change_nothing_but_the_time(tmp_path, sample):
     def call(*arguments) -> str:
         command = [sys.executable, "-W", "error", "-m", "jaxro", "orient", *map(str, arguments)]
-        environment = os.environ | {"JAXRO_CACHE": str(tmp_path / "kept")}
+        environment = os.environ | {"JAXRO_CACHE": str(tmp_path / "kept"), "JAX_COMPILATION_CACHE_DIR": ""}
         done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
         assert not done.stderr
         return done.stdout

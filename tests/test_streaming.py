@@ -205,6 +205,90 @@ def test_a_run_that_is_killed_at_its_very_end_is_resumed(folder, whole, monkeypa
     assert contents(out) == contents(whole)
 
 
+def test_a_run_that_is_killed_before_its_journal_is_gone_is_resumed(folder, whole, monkeypatch):
+    """The folder has its name and the journal is still in it, or the journal has not got its first line yet."""
+    out, remove = folder / "named", Path.unlink
+
+    def killed(path, missing_ok=False):
+        if path == out / JOURNAL:
+            raise KeyboardInterrupt
+        remove(path, missing_ok)
+
+    with monkeypatch.context() as stop:
+        stop.setattr(Path, "unlink", killed)
+        with pytest.raises(KeyboardInterrupt):
+            stream(folder / "table.parquet", out)
+    assert (out / JOURNAL).exists()
+    nothing_left = lambda job, told: [job.left[0]] if job.left else []
+    assert stream(folder / "table.parquet", out, resume=True, engine=nothing_left)
+    assert contents(out) == contents(whole)
+    torn = folder / "torn.unfinished"
+    torn.mkdir()
+    (torn / JOURNAL).write_text('{"request": {"prog')
+    assert stream(folder / "table.parquet", folder / "torn", resume=True)
+    assert contents(folder / "torn") == contents(whole)
+
+
+def test_force_replaces_results_and_nothing_else(folder, tmp_path):
+    """Whatever else is in the folder is not lost, least of all the table."""
+    table = tmp_path / "mine" / "table.parquet"
+    table.parent.mkdir()
+    table.write_bytes((folder / "table.parquet").read_bytes())
+    found = run("orient", table, "--focal", FOCAL, "--out", table.parent, "--force")
+    assert found.exit_code == 2 and "table.parquet, no tables of an earlier run" in found.output
+    assert list(tmp_path.rglob("*.parquet")) == [table]
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "real")
+    (tmp_path / "real").mkdir()
+    for _ in range(2):
+        assert run("orient", table, "--focal", FOCAL, "--out", link, "--force").exit_code == 0
+        assert (tmp_path / "real" / "summary.json").exists() and link.is_symlink()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "mine", "real"]
+
+
+def test_what_judges_by_sigma_is_not_run_without_one(folder):
+    found = run("clean", folder / "table.parquet", "--focal", FOCAL, "--out", folder / "unjudged")
+    assert found.exit_code == 2 and "neither --sigma nor a column sigma" in found.output
+    assert not (folder / "unjudged").exists() and not (folder / "unjudged.unfinished").exists()
+
+
+def test_cameras_that_do_not_fit_are_told_before_anything_is_done(folder, tmp_path):
+    """By the table and the line that the user knows, and nothing is left that had to be resumed."""
+    (tmp_path / "camera.toml").write_text("[photo.1]\nfocal = 100\n[photo.2]\nfocal = 100\n")
+    for table, line in (("table.csv", 2), ("table.parquet", 1)):
+        out = tmp_path / "out"
+        found = run("orient", folder / table, "--camera", tmp_path / "camera.toml", "--parquet", "--out", out)
+        assert found.exit_code == 2 and f"{table}, line {line}, column pair: found 'p000'" in found.output
+    (tmp_path / "camera.toml").write_text("[left]\nfocal = 100\n[right]\nfocal = 100\npixel_size = 2\n")
+    options = ("--camera", tmp_path / "camera.toml", "--sigma", 0.01)
+    found = run("orient", folder / "table.parquet", *options, "--out", tmp_path / "out")
+    assert found.exit_code == 2 and "pixel sizes 1.0 (left) and 2.0 (right)" in found.output
+    assert [path.name for path in tmp_path.iterdir()] == ["camera.toml"]
+
+
+def test_a_table_without_pairs_has_the_name_of_its_file(folder, measured):
+    rows = measured["pair"].count("p000")
+    with (folder / "alone.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(list(measured)[1:])
+        writer.writerows(list(zip(*measured.values(), strict=True))[k][1:] for k in range(rows))
+        file.write("   \n")
+    found = run("orient", folder / "alone.csv", "--focal", FOCAL, "--parquet", "--out", folder / "alone")
+    assert found.exit_code == 0, found.output
+    assert pq.read_table(folder / "alone" / "elements").column("pair").to_pylist() == ["alone"]
+
+
+def test_names_are_those_of_csv_tables(folder, measured):
+    """Blanks around a name do not make it another one."""
+    spaced = dict(measured, pair=[f"{name} " if i % 2 else name for i, name in enumerate(measured["pair"])])
+    with (folder / "spaced.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([list(spaced), *zip(*spaced.values(), strict=True)])
+    assert (
+        run("orient", folder / "spaced.csv", "--focal", FOCAL, "--parquet", "--out", folder / "spaced").exit_code == 0
+    )
+    assert pq.read_table(folder / "spaced" / "elements").column("pair").to_pylist() == sorted({*measured["pair"]})
+
+
 def test_a_pair_with_a_missing_number_harms_no_other(folder, measured, whole):
     holes = dict(measured, x_left=list(measured["x_left"]))
     holes["x_left"][measured["pair"].index("p007")] = None
@@ -223,6 +307,7 @@ BAD = {
     "unknown": (lambda t: t | {"z": t["x_left"]}, "column z: found an unknown column"),
     "type": (lambda t: t | {"x_left": [str(x) for x in t["x_left"]]}, "column x_left: found values of type string"),
     "unnamed": (lambda t: t | {"pair": [None, *t["pair"][1:]]}, "column pair: found nothing in row 1"),
+    "nameless": (lambda t: t | {"point": [*t["point"][:-1], None]}, "column point: found nothing in row"),
     "empty": (lambda t: {k: v[:0] for k, v in pa.table(t).to_pydict().items()}, "found no"),
 }
 

@@ -91,8 +91,14 @@ Base = Annotated[
 ]
 Minimised = Annotated[Residual, typer.Option(help="What is minimised: whitened conditions, or strict y-parallaxes.")]
 Unit = Annotated[str, typer.Option(help="Name of the photo unit in reports: mm, px.", metavar="NAME")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite the files in a folder that is not empty.")]
-Seed = Annotated[int, typer.Option(help="Seed of the random numbers.", metavar="S")]
+Force = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="Overwrite the files in a folder that is not empty; Parquet results replace those of an earlier run.",
+    ),
+]
+Seed = Annotated[int, typer.Option(help="Seed of the random numbers.", metavar="S", min=0, max=2**63 - 1)]
 
 GridTable = Annotated[
     Path | None,
@@ -151,6 +157,10 @@ Parquet = Annotated[
 Where = Annotated[Engine, typer.Option(help="Where Parquet results are worked on: here, or on a Ray cluster.")]
 
 
-def large(file: Path | None, parquet: bool, resume: bool) -> bool:
-    """Whether the results are Parquet tables, part by part."""
-    return parquet or resume or (file is not None and file.suffix == ".parquet")
+def large(file: Path | None, parquet: bool, resume: bool, tables: str | None, engine: Engine) -> bool:
+    """Whether the results are Parquet tables, part by part; nothing that only these know may be asked of others."""
+    wanted = parquet or resume or (file is not None and file.suffix.lower() == ".parquet")
+    for name, given in (("--tables", tables is not None), ("--engine", engine is not Engine.local)):
+        if given and not wanted:
+            raise typer.BadParameter("it is for Parquet results: add --parquet", param_hint=name)
+    return wanted

@@ -8,6 +8,7 @@ Each table holds focal and, where they are not the defaults, principal_point = [
 """
 
 import re
+import sys
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -92,7 +93,7 @@ def _camera(path: Path, text: str, table: str, entries: Any) -> Camera:
 
 def _fits(key: str, value: Any) -> tuple[bool, str]:
     """Whether a value suits its key, and what would."""
-    number = lambda v: type(v) in (int, float) and np.isfinite(v)
+    number = lambda v: type(v) in (int, float) and abs(v) <= sys.float_info.max
     if key == "y_down":
         return isinstance(value, bool), "true or false"
     if key == "principal_point":
@@ -115,6 +116,14 @@ def _line(text: str, table: str, key: str | None = None) -> int | None:
     return None
 
 
+def check_one_sigma(file: str, line: int | None, left: Camera, right: Camera) -> None:
+    """Raises TableError where one sigma cannot serve two pixel sizes."""
+    if left.pixel_size != right.pixel_size:
+        found = f"sigma with pixel sizes {left.pixel_size!r} (left) and {right.pixel_size!r} (right)"
+        expected = "coordinates in photo units where the pixel sizes differ, so that one sigma serves both photos"
+        raise TableError(file, line, "sigma", found, expected)
+
+
 def to_pair(measured: Measurements, file: str, left: Camera, right: Camera, sigma: float | None = None) -> Pair:
     """Measured coordinates as a `Pair` in photo coordinates; sigma for all points or from the table.
 
@@ -130,9 +139,6 @@ def to_pair(measured: Measurements, file: str, left: Camera, right: Camera, sigm
     deviation = np.ones(count)
     if measured.sigma is not None or sigma is not None:
         deviation = (np.full(count, sigma) if measured.sigma is None else measured.sigma) * left.pixel_size
-        if left.pixel_size != right.pixel_size:
-            found = f"sigma with pixel sizes {left.pixel_size!r} (left) and {right.pixel_size!r} (right)"
-            expected = "coordinates in photo units where the pixel sizes differ, so that one sigma serves both photos"
-            raise TableError(file, measured.lines[0], "sigma", found, expected)
+        check_one_sigma(file, measured.lines[0], left, right)
     fields = (*coordinates, deviation, np.ones(count, bool), np.float64(left.focal), np.float64(right.focal))
     return Pair(*jax.device_put(fields))

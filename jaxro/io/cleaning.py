@@ -20,10 +20,10 @@ from .console import consoles, progress
 from .job import Example, Job, Options
 from .solutions import Solved, solutions
 from .tables import TableError
-from .tolerances import changed, judges_by_sigma, tolerances
+from .tolerances import changed, check_sigma, tolerances
 from .verdicts import Verdict
 
-DEFAULT = "recommended" if "recommended" in PROCEDURES else "two-stage"
+DEFAULT = "recommended"
 """The procedure of users who name none."""
 
 SIMULATED = Example(mock_example.NAME, mock_example.FOCAL, mock_example.TABLE)
@@ -36,9 +36,7 @@ def run(options: Options, name: str, changes: list[str]) -> bool:
     """Read, clean, orient, write, show. True if every pair is cleaned and usable. Raises TableError."""
     procedure = changed(named(name), changes)
     job = jobs.prepared(options, SIMULATED)
-    if judges_by_sigma(procedure) and not job.sigma_known:
-        expected = f"the standard deviation of a coordinate, by which {name} judges, or a column sigma in the table"
-        raise TableError("--sigma", None, None, "neither --sigma nor a column sigma", expected)
+    check_sigma(name, procedure, job.sigma_known)
     console, errors = consoles()
     jobs.warn(errors, job)
     with progress(errors, "Cleaning", len(job.pairs)) as told:

@@ -22,7 +22,7 @@ IN_CACHE = 16_384
 """Matches that are judged together: what stays in the cache of a core."""
 
 PAIRS = 48
-"""Pairs in one call of a program: its own third of a millisecond hidden, and many calls to share out."""
+"""Pairs in one call of a program: enough to hide the .3 ms that a call costs, few enough to share out among threads."""
 
 FEW = 64
 """Matches to which shorter pairs are padded for a search."""

@@ -1,5 +1,6 @@
-"""The files of --out, in full precision, all or none: elements.csv, residuals.csv, points.csv, reliability.csv and
-summary.json.
+"""The files of --out, in full precision: elements.csv, residuals.csv, points.csv, reliability.csv and summary.json.
+
+All or none in a new folder; in one that is there each file takes the place of the old one when all are written.
 
 A number is written as its shortest text that reads back as the same float. What does not exist is an empty cell, null
 in JSON. Headers carry the units; angles are degrees.
@@ -11,7 +12,8 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,11 @@ from .tables import TableError
 
 def check_target(directory: Path, force: bool) -> None:
     """Raises TableError unless a result may be written there."""
+    try:
+        directory.exists()
+    except OSError as error:
+        found = error.strerror or str(error)
+        raise TableError(directory, None, None, found, "a name for the folder of results") from None
     if directory.exists() and not directory.is_dir():
         raise TableError(directory, None, None, "a file", "the name of a folder for the results")
     if not force and directory.exists() and any(directory.iterdir()):
@@ -39,11 +46,15 @@ def texts(solved: list[Solution], units: Units, summary: dict[str, Any]) -> dict
     }
 
 
-def write(directory: Path, texts: Mapping[str, str | bytes]) -> None:
+def write(directory: Path, texts: Mapping[str, str | bytes], read: Sequence[Path | None] = ()) -> None:
     """All files by name, first complete in a folder beside `directory`, then renamed into place.
 
-    Raises TableError, with nothing written, where the disk refuses.
+    Raises TableError, with nothing written, where the disk refuses, or one would take the place of a file that was
+    `read`.
     """
+    for file in read:
+        if file is not None and file.resolve() in [(directory / name).resolve() for name in texts]:
+            raise TableError(file, None, None, "a table to be read where a result is to be written", "another --out")
     draft = directory.absolute().with_name(f".{directory.absolute().name}.{os.getpid()}.partial")
     try:
         draft.mkdir(parents=True)
@@ -78,7 +89,8 @@ def write_file(path: Path, text: str) -> None:
     except OSError as error:
         raise TableError(path, None, None, error.strerror or str(error), "a file that can be written") from None
     finally:
-        draft.unlink(missing_ok=True)
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
 
 
 RESIDUALS = ("q", "v_x_left", "v_y_left", "v_x_right", "v_y_right", "redundancy", "in_front")

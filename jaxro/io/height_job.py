@@ -42,7 +42,7 @@ def run(options: Options) -> bool:
         texts = contents(done)
         picture, why = drawn(done, title)
         texts |= picture
-        files.write(options.out, texts)
+        files.write(options.out, texts, (options.file, options.grid, options.traverses))
         if why:
             errors.print(f"Warning: no picture of the surface: {why}", style="yellow", markup=False)
     report.show(console, done, title)

@@ -6,10 +6,11 @@ import jax
 import numpy as np
 
 from .. import height_planning as planning
+from ..experiments.tables import number
 from ..height_planning import Deviations, Plan
 from .console import consoles
 from .height_job import deviations_of, positive
-from .report import number, table
+from .report import table
 from .tables import TableError
 
 QUANTITIES = {

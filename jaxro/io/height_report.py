@@ -4,8 +4,9 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
+from ..experiments.tables import number
 from .height_results import Done, shares
-from .report import left_out, number, table, worst
+from .report import left_out, table, worst
 
 SOURCES = {
     "camera_height": "camera height",

@@ -159,7 +159,7 @@ def warn(errors: Console, job: Job) -> None:
 def write(job: Job, texts: dict[str, str]) -> None:
     """The files of --out, if it was asked for. Raises TableError."""
     if job.options.out is not None:
-        files.write(job.options.out, texts)
+        files.write(job.options.out, texts, (job.options.file, job.options.camera))
 
 
 def tell(console: Console, job: Job, texts: dict[str, str]) -> None:

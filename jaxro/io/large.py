@@ -1,5 +1,6 @@
 """One call of `jaxro orient` or `jaxro clean` with Parquet tables, from its options to the end of the work."""
 
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterable
@@ -11,17 +12,21 @@ from rich.console import Console
 from rich.markup import escape
 
 from .. import __version__
-from ..ragged import planned
+from ..padding import planned
 from ..rejection import AbstractProcedure
 from . import files, job as jobs, parquet
+from .cameras import Cameras, check_one_sigma
 from .console import consoles, progress
 from .job import Options
 from .records import TABLES, Recorder
 from .report import table as terminal_table
 from .solutions import WARNED
 from .streaming import CONVERTED, JOURNAL, MODIFIED, PART_ROWS, Job, Work, here, parts
-from .tables import TableError
-from .tolerances import tolerances
+from .tables import Measurements, TableError
+from .tolerances import check_sigma, tolerances
+
+REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
+"""What may be in a folder whose place the results take."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +45,14 @@ def run(options: Options, large: Large, procedure: tuple[str, AbstractProcedure]
     console, errors = consoles()
     job = prepared(options, large, procedure)
     told = "Cleaning" if procedure else "Orienting"
-    with progress(errors, told, job.pairs) as tell:
-        tell(job.done)
-        for entry in large.engine(job, tell):
-            job.finished(entry)
-    summary = job.end()
+    try:
+        with progress(errors, told, job.pairs) as tell:
+            tell(job.done)
+            for entry in large.engine(job, tell):
+                job.finished(entry)
+        summary = job.end()
+    except (OSError, parquet.pa.ArrowException) as error:
+        raise _refused(job.work.file, job.work.folder, error) from None
     show(console, job, summary, time.monotonic() - started)
     return good(summary)
 
@@ -65,16 +73,26 @@ def prepared(options: Options, large: Large, procedure: tuple[str, AbstractProce
     for name in chosen:
         if name not in TABLES:
             raise TableError("--tables", None, None, repr(name), f"some of {','.join(TABLES)}")
-    folder = options.out.absolute().with_name(f"{options.out.absolute().name}.unfinished")
-    _check(options.out, folder, options.force, large.resume)
+    out = options.out.resolve()
+    folder = out.with_name(f"{out.name}.unfinished")
+    if large.resume and not folder.exists() and (out / JOURNAL).exists():
+        os.replace(out, folder)  # stopped when only its journal was left to be removed
+    _check(options, out, folder, large.resume)
     try:
         job = _planned(options, large, procedure, chosen, folder)
         job.go_on() if large.resume and job.begun else job.begin()
-    except TableError:
+    except (TableError, OSError, parquet.pa.ArrowException) as error:
         if not large.resume:
             shutil.rmtree(folder, ignore_errors=True)
-        raise
+        raise error if isinstance(error, TableError) else _refused(options.file, folder, error) from None
     return job
+
+
+def _refused(file: Path, folder: Path, error: Exception) -> TableError:
+    """What the disk or a damaged table said."""
+    found = getattr(error, "strerror", None) or str(error).splitlines()[0]
+    expected = f"a table that can be read and a folder {folder} that can be written; what is finished --resume keeps"
+    return TableError(file, None, None, found, expected)
 
 
 def _planned(
@@ -86,16 +104,20 @@ def _planned(
 ) -> Job:
     assert options.file is not None and options.out is not None
     source = options.file
-    if source.suffix != ".parquet":
+    if source.suffix.lower() != ".parquet":
         source = folder / CONVERTED
         if not (large.resume and source.exists() and (folder / JOURNAL).exists()):
             folder.mkdir(parents=True, exist_ok=True)
             parquet.converted(options.file, source)
-    table = parquet.Source(source)
+    table = parquet.Source(source, options.file)
     system = jobs.SYSTEMS[options.elements or "relative"]
     jobs.check_numbers(options, table.has_sigma, str(options.file), system)
     known = table.has_sigma or options.sigma is not None
+    if procedure is not None:
+        check_sigma(*procedure, known)
     scan = table.scan()
+    cameras = jobs.read_cameras(options, jobs.MEASURED)
+    _check_cameras(cameras, scan, options.file, 1 if source == options.file else 2, known)
     pieces = parts(scan.begins, large.part_rows)
     keywords = {"elements": system, "base": options.base, "residual": jobs.RESIDUALS[options.residual]}
     order = tuple(name for name in TABLES if name in ("elements", *chosen))
@@ -103,21 +125,41 @@ def _planned(
         order = (*order[:1], "residuals", *order[1:])
     work = Work(
         source.absolute(),
+        options.file,
         folder,
         planned(scan.lengths, len(pieces)),
-        jobs.read_cameras(options, jobs.MEASURED),
+        cameras,
         options.sigma,
         Recorder(system, order, known, procedure is not None),
         keywords,
         jobs.units_of(options, table.has_sigma, system),
         procedure[1] if procedure else None,
     )
-    return Job(work, pieces, options.out.absolute(), _request(options, order, procedure))
+    return Job(work, pieces, options.out.resolve(), _request(options, order, procedure))
 
 
-def _check(out: Path, folder: Path, force: bool, resume: bool) -> None:
+def _check_cameras(cameras: Cameras, scan: parquet.Scan, file: Path, first: int, sigma: bool) -> None:
+    """Raises TableError for a pair without cameras, or with two that one sigma cannot serve.
+
+    `first`: the line or row of the first point.
+    """
+    one_for_all = cameras.left is not None and cameras.right is not None
+    names = scan.names.slice(0, 1).to_pylist() if one_for_all else scan.names.to_pylist()
+    for name, row in zip(names, scan.begins[:-1].tolist(), strict=False):
+        both = cameras.of(Measurements(str(name), lines=[row + first]), str(file))
+        if sigma:
+            check_one_sigma(str(file), row + first, *both)
+
+
+def _check(options: Options, out: Path, folder: Path, resume: bool) -> None:
     """Raises TableError unless the work may begin, or go on."""
+    force = options.force
     files.check_target(out, force)
+    others = [entry.name for entry in out.iterdir() if entry.name not in REPLACED] if out.exists() else []
+    read = [file for file in (options.file, options.camera) if file is not None and out in file.resolve().parents]
+    if others or read:
+        found = f"{', '.join(sorted(others)[:5])}, no tables of an earlier run" if others else f"{read[0]}, to be read"
+        raise TableError(out, None, None, found, "another folder: Parquet results take the place of the whole folder")
     if resume and not folder.exists():
         raise TableError(folder, None, None, "no such folder", "the --out of a run that was stopped, to resume it")
     if folder.exists() and not resume:
@@ -159,4 +201,5 @@ def show(console: Console, job: Job, summary: dict[str, Any], seconds: float) ->
         named = ", ".join(doubles[:5]) + (", ..." if len(doubles) > 5 else "")
         console.print(f"[yellow]Mind:[/yellow] two points of one name in pairs {escape(named)}")
     rate = f"{summary['pairs']:,} pairs, {summary['rows']:,} points in {seconds:.1f} s"
-    console.print(f"{rate}. Written to {job.target}: {', '.join(job.work.recorder.tables)}, summary.json", markup=False)
+    tables = ", ".join(name for name in (*job.work.recorder.tables, "cleaned") if (job.target / name).exists())
+    console.print(f"{rate}. Written to {job.target}: {tables}, summary.json", markup=False)

@@ -20,6 +20,7 @@ from .tables import ACCEPTED, OPTIONAL, REQUIRED, SHORT, TableError
 
 try:
     import pyarrow as pa
+    import pyarrow.compute as pc
     import pyarrow.csv as arrow_csv
     import pyarrow.parquet as pq
 except ModuleNotFoundError:
@@ -30,9 +31,10 @@ BATCH = 1 << 18
 
 
 class Scan(NamedTuple):
-    """Where the pairs of a table begin, with the end of the table behind them."""
+    """Where the pairs of a table begin, with the end of the table behind them, and their names, an Arrow array."""
 
     begins: Int[np.ndarray, " pairs+1"]
+    names: Any
 
     @property
     def lengths(self) -> Int[np.ndarray, " pair"]:
@@ -43,8 +45,8 @@ class Scan(NamedTuple):
 class Source:
     """A Parquet table of measured points. Raises TableError where it is none."""
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: Path, told: Path | None = None):
+        self.path = told or path  # as it is told of: a CSV table has been converted
         try:
             self._file = pq.ParquetFile(path, pre_buffer=False)
         except (OSError, pa.ArrowInvalid) as error:
@@ -68,21 +70,37 @@ class Source:
         """Where the pairs begin: reads the column `pair` alone. Raises TableError where a pair comes in two parts."""
         if not self.count:
             raise TableError(self.path, None, None, "no points", "one row for every measured point")
+        for name in ("pair", "point"):
+            self._complete(name)
         if "pair" not in self.columns:
-            return Scan(np.array([0, self.count]))
+            return Scan(np.array([0, self.count]), pa.chunked_array([[self.path.stem]]))
         begins, names, row, last = [], [], 0, None
         for batch in self._file.iter_batches(BATCH, columns=[self.columns["pair"]]):
             column = batch.column(0)
-            if column.null_count:
-                empty = row + int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
-                raise TableError(self.path, None, "pair", f"nothing in row {empty + 1}", "the name of the pair")
             starts = _runs(column, last)
             begins.append(starts + row)
             names.append(column.take(starts))
             row, last = row + len(column), column[-1].as_py()
         found = np.concatenate(begins)
-        self._once(pa.chunked_array(names), found)
-        return Scan(np.append(found, row))
+        every = pa.chunked_array(names)
+        self._once(every, found)
+        return Scan(np.append(found, row), every)
+
+    def _complete(self, full: str) -> None:
+        """Raises TableError for a row without a name; reads the column only where the file does not say."""
+        if full not in self.columns:
+            return
+        known, place = self._file.metadata, self._file.schema_arrow.get_field_index(self.columns[full])
+        groups = [known.row_group(k).column(place).statistics for k in range(known.num_row_groups)]
+        if all(told is not None and told.has_null_count and told.null_count == 0 for told in groups):
+            return
+        row = 0
+        for batch in self._file.iter_batches(BATCH, columns=[self.columns[full]]):
+            column = batch.column(0)
+            if column.null_count:
+                row += int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0]) + 1
+                raise TableError(self.path, None, full, f"nothing in row {row}", f"the name of the {full}")
+            row += len(column)
 
     def _once(self, names: Any, begins: np.ndarray) -> None:
         if len(names.unique()) == len(names):
@@ -193,10 +211,9 @@ def ragged(
     begins: np.ndarray,
     cameras: tuple[Camera, Camera] | list[tuple[Camera, Camera]],
     sigma: float | None,
-    file: str,
 ) -> Ragged:
     """The points of a part in photo coordinates; cameras for all pairs, or of each. Missing numbers are NaN."""
-    numbers = lambda name: np.asarray(table.column(name).cast(pa.float64()).to_numpy(), np.float64)
+    numbers = lambda name: np.asarray(table.column(name).cast(pa.float64(), safe=False).to_numpy(), np.float64)
     each = lambda side, value: _spread(cameras, side, value, begins)
     photo = []
     for side, (u, v) in enumerate((("x_left", "y_left"), ("x_right", "y_right"))):
@@ -208,9 +225,6 @@ def ragged(
     given = numbers("sigma") if "sigma" in table.column_names else None if sigma is None else np.full(count, sigma)
     deviation = np.ones(count) if given is None else given * each(0, lambda c: c.pixel_size)
     pairs = len(begins) - 1
-    if given is not None and np.any(each(0, lambda c: c.pixel_size) != each(1, lambda c: c.pixel_size)):
-        expected = "coordinates in photo units where the pixel sizes differ, so that one sigma serves both photos"
-        raise TableError(file, None, "sigma", "sigma with different pixel sizes of left and right photos", expected)
     focals = [
         np.full(pairs, cameras[side].focal)
         if isinstance(cameras, tuple)
@@ -235,11 +249,15 @@ def converted(source: Path, target: Path) -> None:
     except (OSError, UnicodeDecodeError, csv.Error):
         header = []
     full = [_full(name) for name in header]
+    text = ("pair", "point")
+    if header:
+        _columns(source, pa.schema([(name, pa.string() if _full(name) in text else pa.float64()) for name in header]))
     draft = target.with_suffix(".partial")
     try:
-        types = {c: pa.string() if c in ("pair", "point") else pa.float64() for c in full}
+        types = {c: pa.string() if c in text else pa.float64() for c in full}
         reader = arrow_csv.open_csv(
             source,
+            parse_options=arrow_csv.ParseOptions(invalid_row_handler=_blank),
             read_options=arrow_csv.ReadOptions(column_names=full, skip_rows=1, block_size=1 << 24),
             convert_options=arrow_csv.ConvertOptions(column_types=types, null_values=[]),
         )
@@ -247,6 +265,9 @@ def converted(source: Path, target: Path) -> None:
         for batch in reader:
             writer = writer or pq.ParquetWriter(draft, batch.schema, **encoding(batch.schema))
             _check(batch)
+            for place, name in enumerate(batch.schema.names):
+                if name in text:
+                    batch = batch.set_column(place, name, pc.utf8_trim_whitespace(batch.column(place)))  # pyright: ignore[reportAttributeAccessIssue]
             writer.write_batch(batch)
         if writer is None:
             raise pa.ArrowInvalid("no rows")
@@ -257,6 +278,11 @@ def converted(source: Path, target: Path) -> None:
         for _ in _careful(source):  # says what is wrong where
             pass
         raise TableError(source, None, None, str(error).splitlines()[0], "a CSV table of measured points") from None
+
+
+def _blank(row: Any) -> str:
+    """Lines of blanks are no rows, as in `tables`."""
+    return "error" if row.text.strip() else "skip"
 
 
 def _check(batch: Any) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
+from ..experiments.tables import number
 from ..reliability import BOUNDS, CONTROL, Reliability
-from .report import digits, left_out, number, table, worst
+from .report import digits, left_out, table, worst
 from .solutions import Solution, Units
 
 COORDINATES = ("x_left", "y_left", "x_right", "y_right")
@@ -99,7 +100,8 @@ def _doubts(s: Solution, reading: Reliability) -> list[str]:
         others = int(np.sum(w > reading.limit)) - 1
         also = f"; so has {others} other point{'s' * (others != 1)}, perhaps because of it" if others else ""
         said.append(
-            f"Point {s.measured.points[int(np.argmax(w))]} has |w| = {np.max(w):.1f} where {float(reading.limit):.2f} "
+            f"Point {s.measured.points[int(np.argmax(w))]} has |{'w' if reading.known else 'tau'}| = {np.max(w):.2f} "
+            f"where {float(reading.limit):.2f} "
             f"is allowed{also}. Measure it again, or see jaxro clean."
         )
     return said

@@ -1,7 +1,7 @@
 """Orientations of many pairs as columns: what the files of --out hold of a pair, of its points and of its model.
 
-The columns and their units are those of elements.csv, residuals.csv, points.csv and reliability.csv; what does not
-exist is NaN here, null in a table.
+The columns and their units are those of elements.csv, residuals.csv, points.csv and reliability.csv (with `used`, the
+points that take part, and without advice); what does not exist is NaN here, null in a table.
 """
 
 from typing import Any, NamedTuple

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ..experiments.tables import number
 from .solutions import Solution, Units
 
 MOST_ROWS = 40
@@ -45,7 +46,8 @@ def _one(console: Console, s: Solution, units: Units, subtitle: str) -> None:
         console.print(f"{sigma0}   {m_q}   {counted}")
         high = {pair: r for pair, r in s.correlations.items() if abs(r) > HIGH}
         named = ", ".join(f"{pair} {100 * r:.1f} %" for pair, r in high.items()) or "none"
-        console.print(f"Correlations over {HIGH:.0%}: {named}")
+        local = " (rx ry rz: turns of the right photo, b1 b2: of the base)" * bool(high and "rx/ry" in s.correlations)
+        console.print(f"Correlations over {HIGH:.0%}: {named}{local}")
     _points(console, s, units)
 
 
@@ -149,14 +151,3 @@ def digits(size: float | None, at_least: int = 4) -> int:
 def _rms(values: Iterable[float]) -> float:
     squares = [v * v for v in values if math.isfinite(v)]
     return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
-
-
-def number(value: float, decimals: int) -> str:
-    """The number, "-" where it does not exist."""
-    if not math.isfinite(value):
-        return "-"
-    return (
-        f"{value + 0.0:.{decimals}f}".replace("-0." + "0" * decimals, "0." + "0" * decimals)
-        if decimals
-        else f"{value:.0f}"
-    )

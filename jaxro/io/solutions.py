@@ -127,7 +127,7 @@ class Solution:
         if not shown:
             numbers = np.full_like(numbers, np.nan)
         elif not self.usable:
-            numbers[6:] = np.nan
+            numbers[5:] = np.nan
         keys = ("q", "v_x_left", "v_y_left", "v_x_right", "v_y_right", "redundancy", "X", "Y", "Z")
         front = [bool(f) if shown else None for f in o.in_front[:count]]
         return [

@@ -21,8 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..padding import Plan
 from ..pairs import Camera
-from ..ragged import Plan, Ragged, clean_ragged, orient_ragged
+from ..ragged import clean_ragged, orient_ragged
 from ..rejection import AbstractProcedure, Rejection
 from . import cameras as camera_files, parquet, records
 from .files import json_text
@@ -55,9 +56,11 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """Everything that one part needs: the same on this machine or another. Reads `source`, writes below `folder`."""
+    """Everything that one part needs: the same on this machine or another. Reads `source`, writes below `folder`;
+    `file` is the table by the name that the user gave."""
 
     source: Path
+    file: Path
     folder: Path
     plan: Plan
     cameras: camera_files.Cameras
@@ -72,15 +75,15 @@ class Worker:
     """Works on one part after another; its programs stay compiled."""
 
     def __init__(self, work: Work, threads: int | None = None):
-        self._work, self._source, self._threads = work, parquet.Source(work.source), threads
+        self._work, self._source, self._threads = work, parquet.Source(work.source, work.file), threads
 
     def __call__(self, part: Part, told: Callable[[int], None] = lambda done: None) -> dict[str, Any]:
         """The part read, worked on and written; its line for the journal."""
         w = self._work
         table = self._source.rows(int(part.begins[0]), int(part.begins[-1]))
         begins = part.begins - part.begins[0]
-        names = parquet.names(table, begins[:-1], str(w.source))
-        pairs = parquet.ragged(table, begins, self._cameras(names), w.sigma, str(w.source))
+        names = parquet.names(table, begins[:-1], str(w.file))
+        pairs = parquet.ragged(table, begins, self._cameras(names), w.sigma)
         how = {"plan": w.plan, "threads": self._threads}
         kept, outcomes, tables = None, None, {}
         if w.procedure is not None:
@@ -89,7 +92,8 @@ class Worker:
             pairs = pairs._replace(mask=kept)
         progress = lambda done, total: told(done)
         of_pair, of_points = orient_ragged(pairs, read=w.recorder, progress=progress, **how, **w.keywords)
-        tables["elements"] = self._elements(pairs, names, of_pair, outcomes)
+        points = pairs.lengths if kept is None else np.add.reduceat(kept.astype(int), begins[:-1])
+        tables["elements"] = self._elements(points, names, of_pair, outcomes)
         rows = {"pair": names.take(parquet.owners(begins)), "point": table.column("point")}
         if kept is not None:
             tables["cleaned"] = self._cleaned(table, rows, decided, of_points["residuals"]["q"])
@@ -112,10 +116,12 @@ class Worker:
         known = self._work.cameras
         if known.left is not None and known.right is not None:
             return known.left, known.right
-        return [known.of(Measurements(str(name), lines=[0]), str(self._work.source)) for name in names.to_pylist()]
+        return [known.of(Measurements(str(name)), str(self._work.file)) for name in names.to_pylist()]
 
-    def _elements(self, pairs: Ragged, names: Any, of_pair: dict[str, np.ndarray], outcomes: np.ndarray | None) -> Any:
-        values = of_pair | {"result": records.names_of(of_pair["result"], NAMES), "points": pairs.lengths}
+    def _elements(
+        self, points: np.ndarray, names: Any, of_pair: dict[str, np.ndarray], outcomes: np.ndarray | None
+    ) -> Any:
+        values = of_pair | {"result": records.names_of(of_pair["result"], NAMES), "points": points}
         ordered = {c: values[c] for c in records.element_columns(self._work.recorder.system)}
         outcome = {} if outcomes is None else {"outcome": records.names_of(outcomes, OUTCOMES)}
         return records.table({"pair": names}, outcome | ordered, self._work.units)
@@ -177,14 +183,15 @@ class Job:
 
     @property
     def begun(self) -> bool:
-        """Whether there is a journal."""
-        return (self.work.folder / JOURNAL).exists()
+        """Whether there is a journal that says what was asked for."""
+        path = self.work.folder / JOURNAL
+        return path.exists() and any(True for _ in _whole_lines(path))
 
     def begin(self) -> None:
         """A new journal. Raises TableError where the folder cannot be written."""
         try:
             self.work.folder.mkdir(parents=True, exist_ok=True)
-            self._journal({"request": self.request}, "w")
+            self._rewritten()
         except OSError as error:
             found = error.strerror or str(error)
             raise TableError(self.work.folder, None, None, found, "a folder that can be written") from None
@@ -193,19 +200,17 @@ class Job:
         """What an earlier run finished. Raises TableError where it was asked for something else."""
         path = self.work.folder / JOURNAL
         lines = list(_whole_lines(path))
-        before = lines[0].get("request", {}) if lines else {}
+        before = lines[0].get("request", {})
         for key in sorted(set(before) | set(self.request)):
             if before.get(key) != self.request.get(key):
                 found = f"{key} = {before.get(key)!r} in the run to be resumed, {self.request.get(key)!r} now"
                 raise TableError(path, 1, None, found, "the same table and options, or a new --out")
         self.entries = [entry for entry in lines[1:] if self._stands(entry)]
-        self._journal({"request": self.request}, "w")  # without a line that was cut off
-        for entry in self.entries:
-            self._journal(entry)
+        self._rewritten()  # without a line that was cut off
 
     def finished(self, entry: dict[str, Any]) -> None:
         """A part is written: its line in the journal."""
-        self._journal(entry)
+        _append(self.work.folder / JOURNAL, entry)
         self.entries.append(entry)
 
     def end(self) -> dict[str, Any]:
@@ -221,30 +226,39 @@ class Job:
         doubles = [name for entry in self.entries for name in entry["doubles"]]
         whole["pairs_with_two_points_of_one_name"] = doubles
         asked = {key: value for key, value in self.request.items() if key != MODIFIED}
-        summary = {**asked, **whole, "units": asdict(self.work.units)}
+        units = asdict(self.work.units) | {"sigma0": self.work.units.sigma0 or None, "angles": "deg"}
+        summary = {**asked, **whole, "units": units}
         (folder / "summary.json").write_text(json_text(summary), encoding="utf-8")
         for stray in (*folder.rglob("*.partial"), folder / CONVERTED):
             stray.unlink(missing_ok=True)
         if self.target.exists():
             old = self.target.with_name(f".{self.target.name}.{os.getpid()}.old")
             os.replace(self.target, old)
-            os.replace(folder, self.target)
+        os.replace(folder, self.target)
+        for old in self.target.parent.glob(f".{self.target.name}.*.old"):
             shutil.rmtree(old)
-        else:
-            os.replace(folder, self.target)
         (self.target / JOURNAL).unlink()  # last: a run that is stopped before can still be resumed
         return whole
 
-    def _journal(self, entry: dict[str, Any], mode: str = "a") -> None:
-        with (self.work.folder / JOURNAL).open(mode, encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+    def _rewritten(self) -> None:
+        """The journal of what is known, whole or as it was."""
+        path = self.work.folder / JOURNAL
+        draft = path.with_suffix(".partial")
+        draft.unlink(missing_ok=True)
+        _append(draft, {"request": self.request}, *self.entries)
+        os.replace(draft, path)
 
     def _stands(self, entry: dict[str, Any]) -> bool:
         """Whether the files of a finished part are what they were."""
         place = lambda name: self.work.folder / f"{name}/part-{entry['part']:05}.parquet"
         return all(place(n).exists() and place(n).stat().st_size == size for n, size in entry["files"].items())
+
+
+def _append(path: Path, *entries: dict[str, Any]) -> None:
+    with path.open("a", encoding="utf-8") as file:
+        file.writelines(json.dumps(entry) + "\n" for entry in entries)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _whole_lines(path: Path) -> Iterator[dict[str, Any]]:

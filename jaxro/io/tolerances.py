@@ -51,6 +51,13 @@ def judges_by_sigma(part: Any) -> bool:
     return any(judges_by_sigma(value) for value in entries.values() if isinstance(value, eqx.Module | tuple))
 
 
+def check_sigma(name: str, procedure: AbstractProcedure, known: bool) -> None:
+    """Raises TableError where the procedure judges by a standard deviation that nobody gave."""
+    if judges_by_sigma(procedure) and not known:
+        expected = f"the standard deviation of a coordinate, by which {name} judges, or a column sigma in the table"
+        raise TableError("--sigma", None, None, "neither --sigma nor a column sigma", expected)
+
+
 def _entries(part: Any) -> dict[str, Any]:
     """The fields of a module or the entries of a tuple by name."""
     if isinstance(part, tuple):
