@@ -1,9 +1,9 @@
 """What accuracy a survey over a grid will have, before it is made, and what base or camera height a wanted one needs.
 
 Errors are those of exact propagation through `heights` at the planned geometry. In traverses the points are read anew
-for each leg, the grid once in each square, as `surveys` takes it: of a leg only the readings of its points add up,
-while what squares and grid do to a point is in both legs that meet there and cancels but at the ends. The paper's (13)
-and (16), in `height_accuracy`, let everything add up.
+for each leg, the grid once in each square, as `surveys` takes it: of a leg only the readings of its points add up.
+Errors of the squares and of the grid enter both legs that meet in a point, and cancel except at the ends. The paper's
+(13) and (16), in `height_accuracy`, let everything add up.
 """
 
 from collections.abc import Callable

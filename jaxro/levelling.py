@@ -86,8 +86,8 @@ class Levelled(eqx.Module):
 
     @property
     def suspicious(self) -> Bool[Array, "*batch traverse"]:
-        """The traverses whose |w| exceeds the limit. Only the largest is evidence of an error in its own traverse; it
-        can be in either of two that are equal (parted by a spur only, or a loop of two)."""
+        """The traverses whose |w| exceeds the limit. Only the largest is evidence of an error in its own traverse. If
+        two have the same |w| (joined only by a spur, or a loop of two), the error can be in either."""
         return self.testable & (jnp.abs(self.w) > self.limit[..., None])
 
 

@@ -44,5 +44,5 @@ def model_points(
         keep = finite & jnp.isfinite(lam) & jnp.isfinite(mu)
         return tuple(jnp.where(keep, c, 0.0) for c in model), in_front, use & ~(finite & (least * AT_INFINITY < 1))
 
-    # a part: in a kernel the depths are computed once for all results, elsewhere anew for each, which is quicker there
+    # inside a kernel a `part` makes XLA compute the depths once; outside, it is quicker to compute them for each result
     return jax.vmap(one)(*part(jax.vmap(met))(pair.coordinates, pair.mask), pair.mask)

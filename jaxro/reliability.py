@@ -176,7 +176,7 @@ class Reliability(eqx.Module):
         return jnp.where(there, jnp.where(below < above, 2 * below, 2 * above), 1.0)
 
     def b_level(self) -> PerPair:
-        """The level of the one-sided global test that sees what the tests of the points see (Baarda's B-method)."""
+        """The level at which the one-sided global test has the power of the tests of points (Baarda's B-method)."""
         return critical.b_method(self.level, self.power, jnp.where(self._freedom > 0, self._freedom, 1.0))
 
     def significance_p(self) -> PerElement:

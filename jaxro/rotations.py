@@ -3,7 +3,7 @@
 A vector is a tuple of three scalars, a matrix a tuple of three rows. Under `vmap` every scalar becomes one array over
 the pairs and XLA fuses the lot; no 3x3 array, no LAPACK, no gather.
 
-Two angle orders are in use (design: conventions as equations):
+Two angle orders are in use:
 
 * `r_alpha`, `r_omega`, `r_chi`: the papers' rotations, image to model, R = R_alpha R_omega R_chi
   (Dorozhinsky 1971; about y, x, z);

@@ -30,14 +30,15 @@ SURE = 0.5
 """Standard error of a variance, relative to the pooled variance, above which the group counts as not estimable."""
 
 FLOOR = 1e-6
-"""Smallest variance, of the pooled one, that is iterated with: below it an estimate is zero."""
+"""Smallest variance of the iteration, relative to the pooled one; an estimate that reaches it is reported as zero."""
 
 
 class Components(eqx.Module):
     """Standard deviations of K groups, factors to the sigma of the pairs (mm or px where that is 1).
 
-    `estimable`: whether the pairs determine the group. Where not, its variance was held near that of all measurements
-    together (`pooled` is its root), as if known to half of it; `sigma` is 0 and the errors are infinite. In
+    `estimable`: whether the pairs determine the group. Where not, its variance was tied to that of all measurements
+    together (`pooled` is its root) by a prior with a standard deviation of half of it; `sigma` is 0 and the errors are
+    infinite. In
     near-vertical pairs that is so for x, and for y of the left and right photo unless tilts tell them apart: give them
     one group. `covariance`: of the variances sigma²; rows of what is not estimable are 0. A sigma of 0 that is
     estimable came out negative: the errors of this group are too small to be seen beside the others, and

@@ -15,14 +15,14 @@ install_import_hook("jaxro", "beartype.beartype")
 
 os.environ["JAXRO_CACHE"] = ""  # no test finds what another one left
 # most of the time goes into compiling programs that run once
-cheap = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {cheap}".strip()
+cheap = ("cpu_use_fusion_emitters=false", "backend_optimization_level=0", "cpu_parallel_codegen_split_count=1")
+os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *(f"--xla_{flag}" for flag in cheap)]).strip()
 # what several tests, or processes they start, compile is compiled once; given a size, JAX locks the folder to write
 if "PYTEST_XDIST_WORKER" not in os.environ:  # the process that starts the others, and with which the folder goes
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxro-tests-")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(1 << 34)
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 import jax  # noqa: E402
 

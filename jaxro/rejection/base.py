@@ -32,8 +32,8 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     nothing_to_test = "The procedure does not apply: too few points to reject any."
     no_consensus = (
-        "No orientation was found that so many points agree with that it cannot be an accident. Measure more points, "
-        "or give the standard deviation of the coordinates."
+        "No orientation was found that so many points agree with that it cannot be an accident: what is kept and "
+        "rejected here proves nothing. Measure more points, and see whether the standard deviation is the right one."
     )
     did_not_rest = (
         "The weights did not come to rest, so that the points rejected depend on the number of rounds. Use another "

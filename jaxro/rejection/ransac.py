@@ -34,12 +34,13 @@ class Ransac(AbstractSearch):
     """Find the pose with the least Σ min((r/sigma)², limit²) among those of random subsets of a few points.
 
     MSAC (Torr and Zisserman 2000), local optimisation (Chum, Matas and Kittler 2003). `limit`: root of the chi-squared
-    value of one degree of freedom at .001. The pose of a subset carries their errors, a good point has the variance
-    1 + h by it, h about one: subsets are compared with `margin` times the limit. The best of each block takes `steps`
-    Gauss-Newton steps on the points within that and one on those within the limit, and is scored. The search ends after
-    `count` subsets, or when 1 - (1 - p)^k reaches `confidence`, k the subsets so far, p the share of those without a
-    point beyond the limit. `search` is followed by least squares and the rejection of points with |w| above the normal
-    value of `level` / n, in `rounds` turns: `level` is the probability that a pair without errors loses a point.
+    value of one degree of freedom at .001. The pose of a subset contains the errors of its points, so that a good point
+    has the variance 1 + h, h about one: subsets are compared with `margin` times the limit. The best of each block
+    takes `steps` Gauss-Newton steps on the points within that and one on those within the limit, and is scored. The
+    search ends after `count` subsets, or when 1 - (1 - p)^k reaches `confidence`, k the subsets so far, p the share of
+    those without a point beyond the limit. `search` is followed by least squares and the rejection of points with |w|
+    above the normal value of `level` / n, in `rounds` turns: `level` is the probability that a pair without errors
+    loses a point.
     """
 
     hypotheses: AbstractHypotheses = FivePoint()

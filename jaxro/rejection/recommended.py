@@ -34,8 +34,8 @@ class Recommended(AbstractProcedure):
     """Searches, each only where the one before found nothing convincing, then normalised residuals.
 
     1. Graduated non-convexity from the vertical: no subsets, its work grows with n; right in nearly all near-vertical
-       pairs of fifty and more points with half of them wrong. Not for pairs of fewer than thirty points, where it
-       sometimes ends beside the optimum, with a set that convinces none the less.
+       pairs of fifty and more points with half of them wrong. Skipped for pairs of fewer than thirty points, where it
+       sometimes ends in a wrong set that still convinces.
     2. Random subsets of five points solved by Newton's method from the vertical: for few points, and where 1 fails.
     3. Random subsets of eight points, solved linearly: for photos in any position.
     4. Thirty times as many as in 2: for few points of near-vertical photos, half of them wrong.
@@ -49,10 +49,10 @@ class Recommended(AbstractProcedure):
 
     How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) (u/(1-u))^(k-5) of such
     sets that agree by accident: p = limit / mean |r| of the rejected points is about the share of wrong points that
-    agree by chance, u = `wrong` the share of wrong points expected beforehand, without which a dozen points that agree
-    beside three errors of ten sigma would count as an accident. Above the `accidents` of a stage, or with less than
-    this `share` of the points, which right ones may give a wrong pose as well, the next stage follows; above those of
-    the last the outcome is `no_consensus`. A point behind a photo is rejected, unless infinitely far.
+    agree by chance, u = `wrong` the share of wrong points expected beforehand. (Without this factor a dozen points that
+    agree, beside three errors of ten sigma, would count as an accident.) Above the `accidents` of a stage, or with less
+    than this `share` of the points, which right ones may give a wrong pose as well, the next stage follows; above those
+    of the last the outcome is `no_consensus`. A point behind a photo is rejected, unless infinitely far.
     """
 
     sigma: float | None = None

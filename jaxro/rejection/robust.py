@@ -20,7 +20,7 @@ Values = Float[Array, "point"]
 Use = Bool[Array, "point"]
 
 LEAST = 0.01
-"""No point is taken for less controlled than this when sets are compared: it would go for that alone."""
+"""Smallest redundancy of a point when sets are compared: below it a point would be rejected for that alone."""
 
 
 class AbstractSearch(AbstractProcedure):
