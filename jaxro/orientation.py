@@ -168,7 +168,7 @@ def _inspected(
         known = jax.tree.map(lambda element: jnp.asarray(element, pair.x_left.dtype), start)
         begin = starts.Begin(known, jnp.asarray(False), jnp.asarray(False))
         if base is None and elements is DependentElements and isinstance(known, DependentElements):
-            base = lax.stop_gradient(known.bx)
+            base = lax.stop_gradient(known.bx)  # a choice of scale, not a measurement
     else:
         begin = start(lax.stop_gradient(pair))  # the optimum does not depend on where it is sought
     prepare, condition, observations, cofactor = residual(pair)

@@ -130,7 +130,7 @@ def double(one: PyTree) -> PyTree:
             "jaxro adjusts in double precision, which is switched off in JAX: leave JAX_ENABLE_X64 unset, or call "
             "jax.config.update('jax_enable_x64', True)"
         )
-    return jax.tree.map(lambda a: a.astype(float) if a.dtype == np.float32 else a, one)
+    return jax.tree.map(lambda a: a.astype(float) if getattr(a, "dtype", None) == np.float32 else a, one)
 
 
 def pad(one: Pair, points: int) -> Pair:

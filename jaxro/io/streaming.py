@@ -11,6 +11,7 @@ stopped at any moment goes on with the first part that has no line, and ends in 
 
 import json
 import os
+import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -235,7 +236,8 @@ class Job:
             old = self.target.with_name(f".{self.target.name}.{os.getpid()}.old")
             os.replace(self.target, old)
         os.replace(folder, self.target)
-        for old in self.target.parent.glob(f".{self.target.name}.*.old"):
+        replaced = re.compile(rf"\.{re.escape(self.target.name)}\.\d+\.old")  # by this run, or by one that was killed
+        for old in filter(lambda path: replaced.fullmatch(path.name), list(self.target.parent.iterdir())):
             shutil.rmtree(old)
         (self.target / JOURNAL).unlink()  # last: a run that is stopped before can still be resumed
         return whole

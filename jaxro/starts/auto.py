@@ -16,8 +16,8 @@ class Auto(AbstractStart):
     """A few Gauss-Newton steps from the vertical; where they fit, that is the start, elsewhere `general`.
 
     "Fit" means: rotation and base within `tilt` (rad) of the normal case and a root mean square distance below
-    `tolerance` times the focal length, far above any measuring error and far below what a wrong orientation leaves; of
-    photos that see less than a wide angle times their spread, of which it leaves less.
+    `tolerance` times the focal length, far above any measuring error and far below what a wrong orientation leaves. In
+    photos of a narrow angle it leaves less: there it is `tolerance` times twice the `spread` of the points.
     Of the two solutions of an exactly plane scene this takes the one near the normal case without mention; pass
     `General()` where photos in other positions look at a plane. `steps` count inside a caller's `jit`, where
     the solution ends when the next step would be below 1e-10 instead of 1e-12; alone and in batches all steps from the
