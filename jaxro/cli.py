@@ -15,7 +15,7 @@ except ModuleNotFoundError:
 from .experiments import REPRODUCTIONS
 from .io import arguments as given
 from .io.arguments import Engine, Residual
-from .io.tables import TableError
+from .io.fields import TableError
 from .rejection import PROCEDURES
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, rich_markup_mode=None)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from . import rotations as rot
-from .elements import essential
+from .elements import AbstractElements, essential
 from .pairs import Pair
 from .rotations import Matrix, Vector
 
@@ -82,6 +82,12 @@ def y_parallax(rows: tuple, point: Point, focal_left: Scalar, focal_right: Scala
     (y1, z1), (y2, z2) = ([rot.dot(row, ray) for row in turn] for turn, ray in zip(rows, rays, strict=True))
     # one division, and that by itself: its derivatives then divide no more: a twelfth of a solution
     return focal_left * (y2 * z1 - y1 * z2) * (1 / (z1 * z2))
+
+
+def parallaxes(pair: Pair, pose: AbstractElements) -> Float[Array, " point"]:
+    """q of all points of a pair, whether they take part or not."""
+    rows = tuple(frame[1:] for frame in turned(*pose.relative()))
+    return jax.vmap(lambda point: y_parallax(rows, point, pair.focal_left, pair.focal_right))(pair.coordinates)
 
 
 def rigorous(pair: Pair) -> Adjusted:

@@ -194,11 +194,7 @@ def _inspected(
     length = _length(pair, elements, base, pose)
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
-    frames = tuple(frame[1:] for frame in coplanarity.turned(*pose.relative()))
-    q_of = lambda point, use: jnp.where(
-        use, coplanarity.y_parallax(frames, point, pair.focal_left, pair.focal_right), 0.0
-    )
-    parallax = jax.vmap(q_of)(pair.coordinates, pair.mask)
+    parallax = jnp.where(pair.mask, coplanarity.parallaxes(pair, pose), 0.0)
     model, in_front, far = model_points(pair, pose, chosen, _scale(chosen, pose, length))
 
     freedom = adjustment.degrees_of_freedom
@@ -215,7 +211,7 @@ def _inspected(
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous, RESULTS.two_solutions),
-        (count(pair.mask & ~in_front & ~far) > 0, RESULTS.points_behind_camera),
+        (count(pair.mask & ~in_front & ~far & ~pair.coarse) > 0, RESULTS.points_behind_camera),
         (_undefined(elements, pose, length), RESULTS.elements_undefined),
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
         ((noise**2 * worst > WEAK**2) | (margin < needed * noise), RESULTS.weakly_determined),

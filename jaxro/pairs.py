@@ -50,6 +50,10 @@ class Camera(eqx.Module):
         return (jnp.asarray(u) - u0) * self.pixel_size, sign * (jnp.asarray(v) - v0) * self.pixel_size
 
 
+COARSE = 10.0
+"""Standard deviation, of the weighted mean of all, above which a point says nothing of where the photos stand."""
+
+
 class Pair(eqx.Module):
     """One measured stereo pair, or a batch of them (leading axes on every field).
 
@@ -75,6 +79,13 @@ class Pair(eqx.Module):
     def count(self) -> Float[Array, "*pairs"]:
         """Number of points that take part, as a float."""
         return total(self.mask.astype(self.x_left.dtype))
+
+    @property
+    def coarse(self) -> Bool[Array, "*pairs point"]:
+        """Points that are measured more than COARSE times less accurately than the weighted mean of all."""
+        weight = jnp.where(self.mask, 1 / self.sigma**2, 0.0)
+        mean = total(weight) / jnp.maximum(self.count, 1.0)
+        return self.mask & (weight * COARSE**2 < mean[..., None])
 
     def with_mask(self, mask: Bool[Array, "*pairs point"]) -> "Pair":
         """The same pair with other points taking part."""

@@ -42,8 +42,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "direction nor model points exist. Use photos taken from different places."
     )
     points_behind_camera = (
-        "At least one point lies behind a photo: a wrong match, a sign error in the coordinates, or a wrong solution. "
-        "`in_front` names the points."
+        "At least one accurate point lies behind a photo: a wrong match, a sign error in the coordinates, or a wrong "
+        "solution. `in_front` names the points."
     )
     photos_swapped = (
         "The right photo lies on the other side of the left one than the given base says: "

@@ -133,6 +133,7 @@ BAD = {  # the table, what stands there, what stands there instead, line, column
     "a reading in µm": (READINGS, "53.830", "53830", 4, "parallax", "over it"),
     "a reading in m": (READINGS, "53.830", "0.05383", 4, "parallax", "no point has the parallax"),
     "no reading": (READINGS, "53.830", "", 4, "parallax", "an empty field"),
+    "longer than the world": (READINGS, "53.830", "1e308", 4, "parallax", "'1e308'"),
     "zero parallax": (READINGS, "53.830", "0", 4, "parallax", "a reading of 0"),
     "a word": (READINGS, "53.830", "deep", 4, "parallax", "'deep'"),
     "no reading of the grid": (READINGS, "53.830,55.465", "53.830,", 4, "grid", "no reading of the grid"),
@@ -145,7 +146,7 @@ BAD = {  # the table, what stands there, what stands there instead, line, column
     "unknown point": (LEGS, "main,s2,s3", "main,s2,q", 3, "to", "'q'"),
     "gap in a traverse": (LEGS, "main,s2,s3", "main,s4,s3", 3, "from", "'s4'"),
     "leg to itself": (LEGS, "main,s2,s3", "main,s2,s2", 3, "to", "'s2'"),
-    "short line": (LEGS, "main,s2,s3,", "main,s2,", 3, None, "4 fields"),
+    "short line": (LEGS, "main,s2,s3,", "main,s2,", 3, "fore", "4 fields"),
     "leg reading in µm": (LEGS, "main,s1,s2,5", "main,s1,s2,5000", 2, "back", "over it"),
 }
 
@@ -210,6 +211,7 @@ def test_a_plan_is_told_and_answers_backwards():
         (["--legs", "0"], "--legs"),
         (["--depth", "3000"], "--depth"),
         (["--focal", "0"], "--focal"),
+        (["--side", "1e-300"], "a positive length in mm"),
     ],
 )
 def test_plans_that_cannot_be_say_so(options, said):

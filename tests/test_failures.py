@@ -189,18 +189,21 @@ def test_points_in_a_plane_do_not_say_which_of_two_orientations_is_right(count):
     assert np.sum(wrong & certain) <= 3 and np.mean(found.result == RESULTS.two_solutions) > 0.3
 
 
-def test_points_of_little_accuracy_do_no_harm():
-    """Five of twenty points a thousand times less accurate: as good as without them."""
+@pytest.mark.parametrize("coarse", [3.0, 30.0])
+def test_points_of_little_accuracy_do_no_harm(coarse):
+    """Five of twenty points a thousand or ten thousand times less accurate, these often put behind a photo by their
+    errors: as good as without them."""
     relief = lambda rng: np.column_stack([*rng.uniform(-1, 1, (2, 20)), rng.uniform(-4, -2, 20)])
     coordinates, truth = in_any_position(relief, 60, 5, 0.0)
-    sigma = np.where(np.arange(20) < 15, 0.003, 3.0)
+    sigma = np.where(np.arange(20) < 15, 0.003, coarse)
     coordinates += np.random.default_rng(6).normal(size=coordinates.shape) * sigma
     many = lambda mask: jaxro.orient_batch(
         jaxro.pair(*coordinates, focal=FOCAL, sigma=np.broadcast_to(sigma, coordinates.shape[1:]), mask=mask)
     )
     found, without = many(None), many(np.broadcast_to(sigma < 1, coordinates.shape[1:]))
-    assert np.all(without.usable) and np.mean(found.usable) > 0.9
-    assert set(np.asarray(found.result._value)[~np.asarray(found.usable)]) <= {int(RESULTS.points_behind_camera._value)}
+    assert np.all(without.usable) and np.all(found.usable)
+    behind = ~np.asarray(found.in_front)
+    assert not behind[:, :15].any() and (coarse < 30 or np.sum(behind.any(axis=1)) >= 20)
     along = sum(np.asarray(getattr(found.pose, c)) * truth[:, k] for k, c in enumerate(("bx", "by", "bz")))
     assert np.all(along > np.cos(0.01))
 

@@ -6,7 +6,7 @@ import pytest
 
 from jaxro import Camera
 from jaxro.io import cameras, example, tables
-from jaxro.io.tables import TableError
+from jaxro.io.fields import TableError
 
 HEAD = "point,x_left,y_left,x_right,y_right"
 A, B = "a,1,2,3,4", "b,5,6,7,8"

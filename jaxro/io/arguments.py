@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from .files import is_parquet
+
 
 class System(enum.StrEnum):
     """Elements by the names of the command line."""
@@ -159,7 +161,7 @@ Where = Annotated[Engine, typer.Option(help="Where Parquet results are worked on
 
 def large(file: Path | None, parquet: bool, resume: bool, tables: str | None, engine: Engine) -> bool:
     """Whether the results are Parquet tables, part by part; nothing that only these know may be asked of others."""
-    wanted = parquet or resume or (file is not None and file.suffix.lower() == ".parquet")
+    wanted = parquet or resume or (file is not None and is_parquet(file))
     for name, given in (("--tables", tables is not None), ("--engine", engine is not Engine.local)):
         if given and not wanted:
             raise typer.BadParameter("it is for Parquet results: add --parquet", param_hint=name)

@@ -18,7 +18,8 @@ import jax
 import numpy as np
 
 from ..pairs import Camera, Pair
-from .tables import Measurements, TableError, read_text
+from .fields import TableError, read_text
+from .tables import Measurements
 
 KEYS = ("focal", "principal_point", "pixel_size", "y_down")
 FORMS = "[camera], or [left] and [right], or [photo.NAME] for every photo"

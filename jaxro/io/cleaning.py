@@ -17,9 +17,9 @@ from ..rejection import PROCEDURES, AbstractProcedure
 from . import files, job as jobs, mock_example, verdict_report, verdicts as judged
 from .buckets import each
 from .console import consoles, progress
+from .fields import TableError
 from .job import Example, Job, Options
 from .solutions import Solved, solutions
-from .tables import TableError
 from .tolerances import changed, check_sigma, tolerances
 from .verdicts import Verdict
 
@@ -101,12 +101,7 @@ def clean_all(
 
 
 def _parallaxes(pair_and_pose: tuple[Pair, AbstractElements]) -> Float[Array, "point"]:
-    """q of all points of a pair at its orientation, whether they took part in it or not."""
-    pair, pose = pair_and_pose
-    rows = tuple(frame[1:] for frame in coplanarity.turned(*pose.relative()))
-    return jax.vmap(lambda point: coplanarity.y_parallax(rows, point, pair.focal_left, pair.focal_right))(
-        pair.coordinates
-    )
+    return coplanarity.parallaxes(*pair_and_pose)
 
 
 def _all_parallaxes(pairs_and_poses: tuple[Pair, AbstractElements]) -> Float[Array, "pair point"]:

@@ -24,7 +24,7 @@ from .colmap_cameras import MODELS, PhotoCamera, PhotoPoints, photo_points
 from .colmap_database import Database, Geometry, Matches, images_of, opened
 from .colmap_orientation import Found, Kind
 from .console import consoles, progress
-from .tables import TableError
+from .fields import TableError
 
 CONFIG = {
     Kind.oriented: 2,

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .colmap_cameras import MODELS, OTHERS, PhotoCamera
+from .fields import TableError
 from .files import check_file
-from .tables import TableError
 
 MOST_IMAGES = 2147483647
 WAIT = 1.0

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from . import reading
+from .fields import TableError
 from .solutions import Solution, Units
-from .tables import TableError
 
 
 def check_target(directory: Path, force: bool) -> None:
@@ -33,6 +33,11 @@ def check_target(directory: Path, force: bool) -> None:
         raise TableError(directory, None, None, "a file", "the name of a folder for the results")
     if not force and directory.exists() and any(directory.iterdir()):
         raise TableError(directory, None, None, "a folder that is not empty", "a new folder, or --force to overwrite")
+
+
+def is_parquet(file: Path) -> bool:
+    """Whether the name of a file says that it is a Parquet table."""
+    return file.suffix.lower() in (".parquet", ".pq")
 
 
 def texts(solved: list[Solution], units: Units, summary: dict[str, Any]) -> dict[str, str]:

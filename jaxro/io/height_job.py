@@ -10,9 +10,9 @@ import numpy as np
 from ..height_planning import Deviations
 from . import files, height_example as example, height_report as report, height_tables as tables
 from .console import consoles
+from .fields import TableError
 from .height_results import Done, contents, finished
 from .height_tables import Named
-from .tables import TableError
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def prepared(options: Options) -> Named:
                 raise TableError(name, None, None, "it without READINGS.csv", "the readings that it belongs to")
         name = example.NAME
         texts = (example.READINGS, tables.READINGS), (example.GRID, tables.GRID), (example.TRAVERSES, tables.TRAVERSES)
-        readings, grid, traverses = ((name, tables.rows(text, name, *columns)) for text, columns in texts)
+        readings, grid, traverses = ((name, tables.rows(text, name, columns)) for text, columns in texts)
         return tables.assembled(readings, grid, traverses, example.CAMERA_HEIGHT, example.BASE, deviations)
     if options.grid is None:
         raise TableError("--grid", None, None, "no table of the grid", "--grid GRID.csv with square,side,photo_side")
@@ -85,7 +85,7 @@ def prepared(options: Options) -> Named:
 
 def positive(option: str, value: float | None) -> float:
     """The value. Raises TableError unless it is a length."""
-    if value is None or not (math.isfinite(value) and value > 0):
+    if value is None or not 1 / tables.LONGEST <= value <= tables.LONGEST:
         found = "no value" if value is None else repr(value)
         raise TableError(option, None, None, found, "a positive length in mm")
     return value

@@ -9,9 +9,9 @@ from .. import height_planning as planning
 from ..experiments.tables import number
 from ..height_planning import Deviations, Plan
 from .console import consoles
+from .fields import TableError
 from .height_job import deviations_of, positive
 from .report import table
-from .tables import TableError
 
 QUANTITIES = {
     "height": "a height over the grid (1)",

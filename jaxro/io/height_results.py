@@ -10,8 +10,8 @@ import numpy as np
 from .. import surveys
 from ..results import RESULTS
 from . import files
+from .fields import TableError
 from .height_tables import Named
-from .tables import TableError
 
 
 @dataclass(frozen=True)

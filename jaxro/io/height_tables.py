@@ -8,9 +8,7 @@ traverses  traverse, from, to, back, fore: the legs in order, both readings made
            its corner, of known height
 """
 
-import csv
 import io
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,15 +19,18 @@ import numpy as np
 from ..height_planning import Deviations
 from ..levelling import unconnected
 from ..surveys import Measured, Survey, survey
-from .tables import TableError, read_text
+from . import fields
+from .fields import Columns, TableError
 
 TEXTS = ("point", "square", "traverse", "from", "to")
 POSITIVE = ("side", "photo_side")
-READINGS = ("point", "square", "parallax"), ("grid", "x", "y", "height")
-GRID = ("square", "side", "photo_side"), ("parallax", "height")
-TRAVERSES = ("traverse", "from", "to", "back", "fore"), ()
+READINGS = Columns(("point", "square", "parallax"), ("grid", "x", "y", "height"))
+GRID = Columns(("square", "side", "photo_side"), ("parallax", "height"))
+TRAVERSES = Columns(("traverse", "from", "to", "back", "fore"))
 FOCAL = (3.0, 2000.0)
 """mm: what H l / L, the focal length, may be; outside it some length has another unit."""
+LONGEST = 1e9
+"""mm: no length is longer, and none shorter than its inverse."""
 SCALE = 1.5
 """Factor by which squares of one photo may differ in scale."""
 
@@ -54,69 +55,33 @@ class Named:
     places: np.ndarray | None
 
 
-def rows(text: str, file: str, required: tuple[str, ...], optional: tuple[str, ...]) -> list[Row]:
+def rows(text: str, file: str, columns: Columns) -> list[Row]:
     """The lines of CSV text by the names of its columns. Raises TableError."""
-    accepted = f"the columns {','.join(required)}" + (f", optionally {', '.join(optional)}" if optional else "")
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True, skipinitialspace=True)
-    header: list[str] = []
-    found = []
-    try:
-        for fields in reader:
-            if not any(entry.strip() for entry in fields):
-                continue
-            if not header:
-                header = _header(fields, file, reader.line_num, required, optional, accepted)
-                continue
-            if len(fields) != len(header):
-                expected = f"{len(header)}, as in the header; decimals are written with a point"
-                raise TableError(file, reader.line_num, None, f"{len(fields)} fields", expected)
-            cells = {
-                name: _cell(entry.strip(), file, reader.line_num, name, name in optional)
-                for name, entry in zip(header, fields, strict=True)
-            }
-            found.append(Row(reader.line_num, cells))
-    except csv.Error as error:
-        expected = "comma-separated fields, each quotation closed on its line"
-        raise TableError(file, reader.line_num, None, str(error), expected) from None
+    found, line = [], 1
+    for line, entries in fields.lines_of(io.StringIO(text, newline=""), file, columns):
+        cells = {c: _cell(entry, file, line, c, c in columns.optional) for c, entry in entries.items()}
+        found.append(Row(line, cells))
     if not found:
-        raise TableError(file, reader.line_num + 1, None, "no lines", f"{accepted}, and one line for each below them")
+        raise TableError(file, line + 1, None, "no lines", f"{columns}, and one line for each below them")
     return found
-
-
-def _header(fields, file, line, required, optional, accepted) -> list[str]:
-    names = [entry.strip().lower() for entry in fields]
-    for name in names:
-        if name not in required + optional:
-            raise TableError(file, line, name or None, "an unknown column", f"{accepted}; none is ignored")
-        if names.count(name) > 1:
-            raise TableError(file, line, name, "this column a second time", "each column once")
-    for name in required:
-        if name not in names:
-            raise TableError(file, line, name, "no such column", accepted)
-    return names
 
 
 def _cell(entry: str, file: str, line: int, column: str, optional: bool) -> Any:
     if column in TEXTS:
-        if not entry:
-            raise TableError(file, line, column, "an empty field", f"the name of the {column}")
-        return entry
+        return fields.name(entry, file, line, column)
     if optional and not entry:
         return None
-    try:
-        value = float(entry)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or "_" in entry:
-        raise TableError(file, line, column, repr(entry) if entry else "an empty field", "a number such as 12.345")
+    value = fields.number(entry, file, line, column)
     if column in POSITIVE and value <= 0:
         raise TableError(file, line, column, repr(entry), "a positive length in mm")
+    if abs(value) > LONGEST:
+        raise TableError(file, line, column, repr(entry), f"mm, at most {LONGEST:g}")
     return value
 
 
-def read(path: Path, columns: tuple[tuple[str, ...], tuple[str, ...]]) -> tuple[str, list[Row]]:
+def read(path: Path, columns: Columns) -> tuple[str, list[Row]]:
     """The name of a file and its lines. Raises TableError."""
-    return str(path), rows(read_text(path), str(path), *columns)
+    return str(path), rows(fields.read_text(path), str(path), columns)
 
 
 Table = tuple[str, list[Row]]

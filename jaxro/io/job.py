@@ -16,8 +16,8 @@ from ..pairs import Camera, Pair
 from . import cameras as camera_files, example, files, reading, report, solutions, tables
 from .buckets import each
 from .console import consoles, progress
+from .fields import TableError
 from .solutions import Solution, Solved, Units
-from .tables import TableError
 
 SYSTEMS: dict[str, type[AbstractElements]] = {
     "relative": RelativePose,

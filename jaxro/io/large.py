@@ -17,12 +17,13 @@ from ..rejection import AbstractProcedure
 from . import files, job as jobs, parquet
 from .cameras import Cameras, check_one_sigma
 from .console import consoles, progress
+from .fields import TableError
 from .job import Options
 from .records import TABLES, Recorder
 from .report import table as terminal_table
 from .solutions import WARNED
 from .streaming import CONVERTED, JOURNAL, MODIFIED, PART_ROWS, Job, Work, here, parts
-from .tables import Measurements, TableError
+from .tables import Measurements
 from .tolerances import check_sigma, tolerances
 
 REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
@@ -104,7 +105,7 @@ def _planned(
 ) -> Job:
     assert options.file is not None and options.out is not None
     source = options.file
-    if source.suffix.lower() != ".parquet":
+    if not files.is_parquet(source):
         source = folder / CONVERTED
         if not (large.resume and source.exists() and (folder / JOURNAL).exists()):
             folder.mkdir(parents=True, exist_ok=True)
@@ -200,6 +201,7 @@ def show(console: Console, job: Job, summary: dict[str, Any], seconds: float) ->
     if doubles:
         named = ", ".join(doubles[:5]) + (", ..." if len(doubles) > 5 else "")
         console.print(f"[yellow]Mind:[/yellow] two points of one name in pairs {escape(named)}")
-    rate = f"{summary['pairs']:,} pairs, {summary['rows']:,} points in {seconds:.1f} s"
+    pairs = "1 pair" if summary["pairs"] == 1 else f"{summary['pairs']:,} pairs"
+    rate = f"{pairs}, {summary['rows']:,} points in {seconds:.1f} s"
     tables = ", ".join(name for name in (*job.work.recorder.tables, "cleaned") if (job.target / name).exists())
     console.print(f"{rate}. Written to {job.target}: {tables}, summary.json", markup=False)

@@ -16,7 +16,8 @@ from jaxtyping import Float, Int
 from ..pairs import Camera
 from ..ragged import Ragged
 from . import tables
-from .tables import ACCEPTED, OPTIONAL, REQUIRED, SHORT, TableError
+from .fields import TableError, read_text
+from .tables import COLUMNS
 
 try:
     import pyarrow as pa
@@ -127,7 +128,7 @@ class Source:
             wanted -= len(part)
         self._position = end
         table = pa.Table.from_batches(taken)
-        return table.rename_columns([_full(name) for name in table.column_names])
+        return table.rename_columns([COLUMNS.full(name) for name in table.column_names])
 
     def _seek(self, row: int) -> None:
         """The next batch begins with this row."""
@@ -144,21 +145,11 @@ class Source:
             skip -= min(skip, len(piece))
 
 
-def _full(name: str) -> str:
-    given = name.strip().lower()
-    return SHORT.get(given, given)
-
-
 def _columns(path: Path, schema: Any) -> dict[str, str]:
     """The columns in the table by their full names. Raises TableError for missing, unknown or unsuitable ones."""
-    columns: dict[str, str] = {}
-    for field in schema:
-        full = _full(field.name)
-        if full not in REQUIRED + OPTIONAL:
-            expected = f"{ACCEPTED}; delete or rename it, none is ignored"
-            raise TableError(path, None, field.name, "an unknown column", expected)
-        if full in columns:
-            raise TableError(path, None, field.name, "this column a second time", "each column once")
+    places = COLUMNS.places(schema.names, str(path), None)
+    for full, place in places.items():
+        field = schema.field(place)
         named = full in ("pair", "point")
         t = field.type.value_type if pa.types.is_dictionary(field.type) else field.type
         text = pa.types.is_string(t) or pa.types.is_large_string(t)
@@ -166,11 +157,7 @@ def _columns(path: Path, schema: Any) -> dict[str, str]:
         if not good:
             expected = "text or whole numbers" if named else "numbers"
             raise TableError(path, None, field.name, f"values of type {field.type}", expected)
-        columns[full] = field.name
-    for name in REQUIRED:
-        if name not in columns:
-            raise TableError(path, None, name, "no such column", ACCEPTED)
-    return columns
+    return {full: schema.names[place] for full, place in places.items()}
 
 
 def _runs(column: Any, last: Any) -> np.ndarray:
@@ -248,10 +235,10 @@ def converted(source: Path, target: Path) -> None:
             header = next(csv.reader(file), [])
     except (OSError, UnicodeDecodeError, csv.Error):
         header = []
-    full = [_full(name) for name in header]
-    text = ("pair", "point")
     if header:
-        _columns(source, pa.schema([(name, pa.string() if _full(name) in text else pa.float64()) for name in header]))
+        COLUMNS.places(header, str(source), None)
+    full = [COLUMNS.full(name) for name in header]
+    text = ("pair", "point")
     draft = target.with_suffix(".partial")
     try:
         types = {c: pa.string() if c in text else pa.float64() for c in full}
@@ -301,7 +288,7 @@ def _careful(path: Path) -> Iterator[tuple]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             yield from tables.checked(file, str(path))
     except (OSError, UnicodeDecodeError):
-        tables.read_text(path)  # says which
+        read_text(path)  # says which
 
 
 def write(table: Any, path: Path) -> None:

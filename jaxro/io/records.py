@@ -6,7 +6,6 @@ points that take part, and without advice); what does not exist is NaN here, nul
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
@@ -58,7 +57,7 @@ class Recorder(NamedTuple):
         there = lambda value: jnp.where(told, value, jnp.nan)
         v = {f"v_{c}": there(value) for c, value in zip(COORDINATES, o.corrections(pair), strict=True)}
         front = jnp.where(told, o.in_front.astype(jnp.int8), jnp.int8(-1))
-        q = self._parallaxes(pair, o) if self.all_parallaxes else o.parallax
+        q = coplanarity.parallaxes(pair, o.pose) if self.all_parallaxes else o.parallax
         return {"q": there(q), **v, "redundancy": jnp.where(o.usable, o.redundancy, jnp.nan), "in_front": front}
 
     def points(self, pair: Pair, o: Orientation) -> Columns:
@@ -75,12 +74,6 @@ class Recorder(NamedTuple):
         out |= {f"detectable_{c}": good(value) for c, value in zip(COORDINATES, r.detectable, strict=True)}
         effects = zip(COORDINATES, r.effect_height, strict=True)
         return out | {f"effect_on_Z_of_{c}": good(value) for c, value in effects}
-
-    def _parallaxes(self, pair: Pair, o: Orientation) -> Array:
-        """q of all points, whether they took part or not."""
-        rows = tuple(frame[1:] for frame in coplanarity.turned(*o.pose.relative()))
-        q = lambda point: coplanarity.y_parallax(rows, point, pair.focal_left, pair.focal_right)
-        return jax.vmap(q)(pair.coordinates)
 
 
 COLUMNS = {

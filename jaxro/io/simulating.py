@@ -19,9 +19,9 @@ from ..rejection import PROCEDURES
 from . import files, job as jobs
 from .cleaning import named
 from .console import consoles, progress
+from .fields import TableError
 from .job import Options
 from .solutions import ADVICE, NAMES
-from .tables import TableError
 
 SIGMA = 0.01
 """mm, of the standard layout, as in the papers."""

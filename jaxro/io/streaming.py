@@ -27,10 +27,11 @@ from ..pairs import Camera
 from ..ragged import clean_ragged, orient_ragged
 from ..rejection import AbstractProcedure, Rejection
 from . import cameras as camera_files, parquet, records
+from .fields import TableError
 from .files import json_text
 from .records import Recorder
 from .solutions import NAMES, Units
-from .tables import Measurements, TableError
+from .tables import Measurements
 from .verdicts import NAMES as OUTCOMES, decision
 
 PART_ROWS = 1 << 19

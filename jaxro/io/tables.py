@@ -5,9 +5,7 @@ form of the first five. Coordinates and sigma are in the units of the measuremen
 coordinates. Nothing is skipped or guessed: whatever does not fit stops the reading with file, line and column.
 """
 
-import csv
 import io
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,23 +13,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-REQUIRED = ("point", "x_left", "y_left", "x_right", "y_right")
-OPTIONAL = ("pair", "sigma")
-SHORT = {"id": "point", "xl": "x_left", "yl": "y_left", "xr": "x_right", "yr": "y_right"}
-ACCEPTED = f"the columns {','.join(REQUIRED)} (or {','.join(SHORT)}), optionally {' and '.join(OPTIONAL)}"
+from . import fields
+from .fields import Columns, TableError, read_text
 
-
-class TableError(ValueError):
-    """Input that cannot be used: where it is, what was found there, what was expected."""
-
-    def __init__(self, file: str | Path, line: int | None, column: str | None, found: str, expected: str):
-        self.file, self.line, self.column, self.found, self.expected = str(file), line, column, found, expected
-        place = [self.file]
-        if line is not None:
-            place.append(f"line {line}")
-        if column is not None:
-            place.append(f"column {column}")
-        super().__init__(f"{', '.join(place)}: found {found}; expected {expected}")
+COLUMNS = Columns(
+    ("point", "x_left", "y_left", "x_right", "y_right"),
+    ("pair", "sigma"),
+    {"id": "point", "xl": "x_left", "yl": "y_left", "xr": "x_right", "yr": "y_right"},
+)
+NUMBERS = (*COLUMNS.required[1:], "sigma")
 
 
 @dataclass
@@ -68,21 +58,6 @@ class Table:
         return self.pairs[0].sigma is not None
 
 
-def read_text(path: Path) -> str:
-    """The UTF-8 text of a file. Raises TableError if it cannot be read or is not UTF-8."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        expected = "a readable file; check the path and its permissions"
-        raise TableError(path, None, None, f"no file that can be read ({error.strerror or error})", expected) from None
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        found = f"the byte 0x{data[error.start]:02x}"
-        raise TableError(path, line, None, found, "UTF-8 text; save the table as CSV UTF-8") from None
-
-
 def read(path: Path) -> Table:
     """The pairs of a CSV file; without a column `pair` one pair, named after the file. Raises TableError."""
     return parse(read_text(path), str(path), path.stem)
@@ -114,19 +89,13 @@ def parse(text: str, file: str, name: str) -> Table:
     return Table(file, list(pairs.values()), [_twins(file, pair, found) for pair, found in twins.items()])
 
 
-def checked(lines: Iterable[str], file: str, name: str = "") -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
+def checked(text: Iterable[str], file: str, name: str = "") -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
     """(line number, pair, point, numbers) of every line below the header, each field looked at. Raises TableError."""
-    rows = _rows(lines, file)
-    line, header = next(rows, (1, None))
-    if header is None:
-        raise TableError(file, 1, None, "no text at all", f"a header line with {ACCEPTED}")
-    columns = _columns(header, file, line)
-    numbers = [c for c in (*REQUIRED[1:], "sigma") if c in columns]
-    for line, row in rows:
-        _check_length(row, columns, file, line)
-        point = _name(row[columns["point"]], file, line, "point")
-        pair = _name(row[columns["pair"]], file, line, "pair") if "pair" in columns else name
-        yield line, pair, point, tuple(_number(row[columns[c]], file, line, c) for c in numbers)
+    for line, cells in fields.lines_of(text, file, COLUMNS):
+        point = fields.name(cells["point"], file, line, "point")
+        pair = fields.name(cells["pair"], file, line, "pair") if "pair" in cells else name
+        numbers = (c for c in NUMBERS if c in cells)
+        yield line, pair, point, tuple(_number(cells[c], file, line, c) for c in numbers)
 
 
 def _twins(file: str, pair: str, found: list[str]) -> str:
@@ -137,69 +106,9 @@ def _twins(file: str, pair: str, found: list[str]) -> str:
     )
 
 
-def _rows(lines: Iterable[str], file: str) -> Iterator[tuple[int, list[str]]]:
-    """(line number, fields) of every line that is not blank."""
-    reader = csv.reader(lines, strict=True, skipinitialspace=True)
-    while True:
-        try:
-            row = next(reader)
-        except StopIteration:
-            return
-        except csv.Error as error:
-            expected = "comma-separated fields, each quotation closed on its line"
-            raise TableError(file, reader.line_num, None, str(error), expected) from None
-        if any(entry.strip() for entry in row):
-            yield reader.line_num, row
-
-
-def _columns(header: list[str], file: str, line: int) -> dict[str, int]:
-    """The place of every column by its full name."""
-    columns: dict[str, int] = {}
-    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        raise TableError(
-            file, line, None, f"the header {header[0]!r}", "fields separated by commas, decimals by points"
-        )
-    for place, entry in enumerate(header):
-        given = entry.strip().lower()
-        full = SHORT.get(given, given)
-        if full not in REQUIRED + OPTIONAL:
-            what = f"an unknown column {entry!r}" if given else f"no name in field {place + 1} of the header"
-            raise TableError(file, line, given or None, what, f"{ACCEPTED}; delete or rename it, none is ignored")
-        if full in columns:
-            raise TableError(file, line, given, "this column a second time", "each column once; delete one of the two")
-        columns[full] = place
-    for name in REQUIRED:
-        if name not in columns:
-            raise TableError(file, line, name, "no such column", ACCEPTED)
-    return columns
-
-
-def _check_length(row: list[str], columns: dict[str, int], file: str, line: int) -> None:
-    if len(row) < len(columns):
-        missing = next(name for name, place in columns.items() if place == len(row))
-        raise TableError(file, line, missing, f"{len(row)} fields", f"{len(columns)}, as in the header")
-    if len(row) > len(columns):
-        expected = f"{len(columns)}, as in the header; decimals are written with a point, names with commas in quotes"
-        raise TableError(file, line, None, f"{len(row)} fields", expected)
-
-
-def _name(text: str, file: str, line: int, column: str) -> str:
-    if not text.strip():
-        raise TableError(file, line, column, "an empty field", f"the name of the {column}")
-    return text.strip()
-
-
 def _number(text: str, file: str, line: int, column: str) -> float:
     """A finite number; positive for sigma."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = None
-    if value is None or "_" in text:  # Python reads 1_0 as 10; a measuring table does not
-        found = repr(text) if text.strip() else "an empty field"
-        raise TableError(file, line, column, found, "a number such as -12.345; delete the line to leave the point out")
-    if not math.isfinite(value):
-        raise TableError(file, line, column, repr(text), "a finite number; delete the line to leave the point out")
+    value = fields.number(text, file, line, column, "; delete the line to leave the point out")
     if column == "sigma" and value <= 0:
         raise TableError(file, line, column, repr(text), "a positive standard deviation in the unit of the coordinates")
     return value

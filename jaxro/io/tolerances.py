@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 
 from ..rejection import AbstractProcedure
-from .tables import TableError
+from .fields import TableError
 
 Number = bool | int | float | None
 

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..elements import IndependentElements
 from ..rejection import OUTCOMES, Log, Rejection
 from .files import csv_text, head, json_text
-from .tables import REQUIRED, Measurements
+from .tables import COLUMNS, Measurements
 
 NAMES = {int(item._value): name for name, item in OUTCOMES._name_to_item.items()}
 """Names of the outcomes by their number."""
@@ -132,7 +132,7 @@ def texts(verdicts: list[Verdict], unit: str, summary: dict[str, Any]) -> dict[s
 
 def _point_rows(verdicts: list[Verdict], unit: str) -> list[list[Any]]:
     sigma = [] if verdicts[0].measured.sigma is None else ["sigma"]
-    header = ["pair", *REQUIRED, *sigma, "verdict", "order", "statistic", "limit", head("q", unit)]
+    header = ["pair", *COLUMNS.required, *sigma, "verdict", "order", "statistic", "limit", head("q", unit)]
     rows: list[tuple[int, list[Any]]] = []
     for v in verdicts:
         m, d = v.measured, v.decision

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import rotations as rot
 from ..elements import RelativePose
-from .problems_last import problems_last
+from .problems_last import cross, problems_last
 
 TINY = 1e-300
 SQUARINGS = 4
@@ -58,7 +58,7 @@ def _decompose(essential: Square) -> tuple[Float[Array, "2 3 3 problem"], Three]
     base = base / jnp.sqrt(jnp.maximum(jnp.sum(base * base, axis=0, keepdims=True), TINY))
     # of cof(E) only the part along the base belongs to a matrix of rank two
     along = base[:, None] * jnp.sum(base[:, None] * c, axis=0)[None]
-    turned = _cross(base[:, None], e)
+    turned = cross(base[:, None], e)
     both = jnp.stack([along + turned, along - turned], axis=2)
     return jnp.moveaxis(lax.fori_loop(0, POLAR_STEPS, _polar_step, both), 2, 0), base
 
@@ -80,8 +80,8 @@ def _in_front(rotation: Square, base: Three, left, right, mask):
     p1, b = jnp.moveaxis(left, 1, 0), base[:, None]
     p2 = jnp.sum(rotation[:, :, None] * jnp.moveaxis(right, 1, 0)[None], axis=1)
     # λ and μ times |p1 x R p2|²
-    normal = _cross(p1, p2)
-    first, second = jnp.sum(_cross(b, p2) * normal, axis=0), jnp.sum(_cross(b, p1) * normal, axis=0)
+    normal = cross(p1, p2)
+    first, second = jnp.sum(cross(b, p2) * normal, axis=0), jnp.sum(cross(b, p1) * normal, axis=0)
     ahead, behind = (first > 0) & (second > 0), (first < 0) & (second < 0)
     return jnp.sum(mask & ahead, axis=0), jnp.sum(mask & behind, axis=0)
 
@@ -93,11 +93,6 @@ def _polar_step(_, m: Float[Array, "3 3 2 problem"]) -> Float[Array, "3 3 2 prob
     return (m + c / jnp.maximum(determinant, 1e-30)[None, None]) / 2
 
 
-def _cross(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
-    """a x b over the first axis."""
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
 def _cofactors(m: Float[Array, "3 3 ..."]) -> Float[Array, "3 3 ..."]:
     """cof(M): its rows are the cross products of the rows of M."""
     columns = jnp.swapaxes(m, 0, 1)
@@ -105,7 +100,7 @@ def _cofactors(m: Float[Array, "3 3 ..."]) -> Float[Array, "3 3 ..."]:
         jnp.concatenate([columns[:, 1:], columns[:, :1]], 1),
         jnp.concatenate([columns[:, 2:], columns[:, :2]], 1),
     )
-    return jnp.swapaxes(_cross(after, before), 0, 1)
+    return jnp.swapaxes(cross(after, before), 0, 1)
 
 
 def _scaled(m: Square, squares: float) -> Square:

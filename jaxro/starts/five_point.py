@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .null_space import null_space, reflected, reflector
-from .problems_last import problems_last
+from .problems_last import cross, problems_last
 
 TINY = 1e-300
 ROOT_STEPS = 6
@@ -72,7 +72,7 @@ def _constraints(basis: Float[Array, "4 3 3 problem"]) -> Float[Array, "10 20 pr
     # term [square, letter]: (E Eᵀ - tr/2) E and row0 . (row1 x row2)
     parts = (symmetric[:, None, :, k, None] * basis[None, :, None, k] for k in range(3))
     cubic = jnp.asarray(sum(parts)).reshape(40, 9, -1)
-    normal = (_cross(one[:, 1], two[:, 2], 1) + _cross(two[:, 1], one[:, 2], 1)) * half[:, 0]
+    normal = (cross(one[:, 1], two[:, 2], 1) + cross(two[:, 1], one[:, 2], 1)) * half[:, 0]
     determinant = jnp.sum(normal[:, None] * basis[None, :, 0], axis=2).reshape(40, 1, -1)
     terms = jnp.concatenate([cubic, determinant], axis=1)
     return jnp.swapaxes(jnp.tensordot(jnp.asarray(COLLECT, basis.dtype), terms, 1), 0, 1)
@@ -185,13 +185,6 @@ def _risen(roots: Float[Array, "2 n problem"], polynomial):
     return jnp.where(found, x, better), found
 
 
-def _cross(a: Array, b: Array, axis: int) -> Array:
-    """a x b along one axis of three."""
-    a0, a1, a2 = (lax.index_in_dim(a, i, axis, keepdims=False) for i in range(3))
-    b0, b1, b2 = (lax.index_in_dim(b, i, axis, keepdims=False) for i in range(3))
-    return jnp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=axis)
-
-
 def _coefficients(b: Float[Array, "3 3 5 problem"], z: Float[Array, "10 problem"], w: Float[Array, "10 problem"]):
     """(x, y, z, w) of every root: the null vector of B, the longest cross product of two of its rows."""
 
@@ -205,7 +198,7 @@ def _coefficients(b: Float[Array, "3 3 5 problem"], z: Float[Array, "10 problem"
     b = b[:, :, :, None]
     rows = jnp.concatenate([value(b[:, :2, :4]), value(b[:, 2:])], axis=1)
     rows = rows / jnp.maximum(jnp.max(jnp.abs(rows), axis=(0, 1), keepdims=True), TINY)
-    normals = _cross(rows, jnp.concatenate([rows[1:], rows[:1]]), 1)
+    normals = cross(rows, jnp.concatenate([rows[1:], rows[:1]]), 1)
     lengths = jnp.sum(normals * normals, axis=1)
     n = jnp.where((lengths[1] > lengths[0])[None], normals[1], normals[0])
     n = jnp.where((lengths[2] > jnp.maximum(lengths[0], lengths[1]))[None], normals[2], n)

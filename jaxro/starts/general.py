@@ -33,9 +33,6 @@ BEHIND = 0.25
 CERTAIN = 2.576
 """Normal quantile, of one in 200, from which the better of two orientations is taken for the right one."""
 
-COARSE = 10.0
-"""Standard deviation, of the weighted mean of all, above which a point does not help to find a start."""
-
 ENOUGH = 10
 """Points that are enough for a start."""
 
@@ -91,10 +88,8 @@ class General(AbstractStart):
 
 
 def _accurate(pair: Pair) -> Pair:
-    """The pair without the points of which a start has nothing to learn, if enough are left."""
-    weight = jnp.where(pair.mask, 1 / pair.sigma**2, 0.0)
-    mean = jnp.sum(weight) / jnp.maximum(pair.count, 1.0)
-    good = pair.mask & (weight * COARSE**2 >= mean)
+    """The pair without its coarse points, of which a start has nothing to learn, if enough are left."""
+    good = pair.mask & ~pair.coarse
     return cleaned(pair.with_mask(jnp.where(jnp.sum(good) >= ENOUGH, good, pair.mask)))[0]
 
 

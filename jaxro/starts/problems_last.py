@@ -4,7 +4,16 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.custom_batching import custom_vmap
+from jaxtyping import Array
+
+
+def cross(a: Array, b: Array, axis: int = 0) -> Array:
+    """a x b along one axis of three."""
+    a0, a1, a2 = (lax.index_in_dim(a, i, axis, keepdims=False) for i in range(3))
+    b0, b1, b2 = (lax.index_in_dim(b, i, axis, keepdims=False) for i in range(3))
+    return jnp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=axis)
 
 
 def problems_last(solve: Callable) -> Callable:
