@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from . import rotations as rot
 from .normal_equations import slopes
@@ -30,6 +30,9 @@ from .rotations import Matrix, Vector
 Scalar = Float[Array, "..."]
 Step = tuple[Scalar, ...]
 """Five numbers"""
+
+NOTHING = 1e-6
+"""Component of a unit base that cannot be told from zero."""
 
 
 class AbstractElements(eqx.Module):
@@ -70,6 +73,16 @@ class AbstractElements(eqx.Module):
     @abc.abstractmethod
     def from_relative(cls, rotation: Matrix, base: Vector, length: Scalar) -> "AbstractElements":
         """The elements of a rotation matrix and unit base; `length` is what the system takes as given of the base."""
+
+    @classmethod
+    @abc.abstractmethod
+    def scale(cls, base: Vector, length: Scalar) -> Scalar:
+        """What a unit base is multiplied by in the model of the system."""
+
+    @classmethod
+    @abc.abstractmethod
+    def exist(cls, base: Vector, length: Scalar) -> Bool[Array, "..."]:
+        """Whether the system has elements for such a unit base, of which this is given."""
 
 
 class RelativePose(AbstractElements):
@@ -166,6 +179,14 @@ class RelativePose(AbstractElements):
         del length
         return cls(*rot.to_quaternion(rotation), *base)
 
+    @classmethod
+    def scale(cls, base: Vector, length: Scalar) -> Scalar:
+        return length
+
+    @classmethod
+    def exist(cls, base: Vector, length: Scalar) -> Bool[Array, "..."]:
+        return jnp.ones_like(length, bool)
+
 
 class IndependentElements(AbstractElements):
     """phi1, kappa1, omega2, phi2, kappa2 (the papers' alpha, chi, omega', alpha', chi'); base (b, 0, 0)."""
@@ -205,6 +226,14 @@ class IndependentElements(AbstractElements):
         phi2, omega2, kappa2 = rot.alpha_omega_chi(rot.product(left, rotation))
         return cls(phi1, kappa1, omega2, phi2, kappa2)
 
+    @classmethod
+    def scale(cls, base: Vector, length: Scalar) -> Scalar:
+        return length
+
+    @classmethod
+    def exist(cls, base: Vector, length: Scalar) -> Bool[Array, "..."]:
+        return (rot.length(base[0], base[1]) >= NOTHING) & jnp.isfinite(length) & (length > 0)
+
 
 class DependentElements(AbstractElements):
     """by, bz (unit of bx), omega, phi, kappa; bx is given and fixes the scale of the model."""
@@ -236,8 +265,16 @@ class DependentElements(AbstractElements):
 
     @classmethod
     def from_relative(cls, rotation: Matrix, base: Vector, length: Scalar) -> "DependentElements":
-        scale = length / base[0]
+        scale = cls.scale(base, length)
         return cls(scale * base[1], scale * base[2], *rot.omega_phi_kappa(rot.transpose(rotation)), length)
+
+    @classmethod
+    def scale(cls, base: Vector, length: Scalar) -> Scalar:
+        return length / base[0]
+
+    @classmethod
+    def exist(cls, base: Vector, length: Scalar) -> Bool[Array, "..."]:
+        return (jnp.abs(base[0]) >= NOTHING) & jnp.isfinite(length) & (length != 0)
 
 
 def vertical(like: Scalar) -> RelativePose:

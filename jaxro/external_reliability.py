@@ -57,7 +57,6 @@ def _of_parameters(orientation: Orientation):
     """
     system = type(orientation.elements)
     elements = orientation.elements
-    dependent = isinstance(elements, DependentElements)
     length = elements.bx if isinstance(elements, DependentElements) else jnp.ones_like(orientation.pose.bx)
 
     def linearly(pose: RelativePose, length):
@@ -65,7 +64,7 @@ def _of_parameters(orientation: Orientation):
             moved = pose.moved(x)
             chosen = convert(moved, system, length)
             base = moved.relative()[1]
-            scaled = rot.scaled(base, length / moved.bx if dependent else length)
+            scaled = rot.scaled(base, system.scale(base, length))
             return (x if system is RelativePose else chosen.values()), (scaled, chosen.model_frame()[2])
 
         origin = (jnp.zeros_like(length),) * 5

@@ -195,7 +195,8 @@ def _inspected(
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
     parallax = jnp.where(pair.mask, coplanarity.parallaxes(pair, pose), 0.0)
-    model, in_front, far = model_points(pair, pose, chosen, _scale(chosen, pose, length))
+    unit = pose.bx, pose.by, pose.bz
+    model, in_front, far = model_points(pair, pose, chosen, elements.scale(unit, length))
 
     freedom = adjustment.degrees_of_freedom
     checked = freedom > 0
@@ -212,7 +213,7 @@ def _inspected(
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous, RESULTS.two_solutions),
         (count(pair.mask & ~in_front & ~far & ~pair.coarse) > 0, RESULTS.points_behind_camera),
-        (_undefined(elements, pose, length), RESULTS.elements_undefined),
+        (~elements.exist(unit, length), RESULTS.elements_undefined),
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
         ((noise**2 * worst > WEAK**2) | (margin < needed * noise), RESULTS.weakly_determined),
     ):
@@ -269,11 +270,6 @@ def _length(pair: Pair, system: type[AbstractElements], base: ArrayLike | None, 
     return jnp.where((pose.bx < 0) & (system is DependentElements), -mean, mean)
 
 
-def _scale(chosen: AbstractElements, pose: RelativePose, length):
-    """Length of the base in the model of the chosen elements."""
-    return length / pose.bx if isinstance(chosen, DependentElements) else length
-
-
 def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractElements], length):
     """The elements in the chosen system and their cofactors J Q Jᵀ."""
     if type(solved) is system and system is IndependentElements:
@@ -294,15 +290,6 @@ def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractEl
     jacobian = jax.vmap(push, out_axes=1)(*jnp.eye(5, dtype=cofactor.dtype))
     right = jnp.sum(jacobian[:, :, None] * cofactor[None, :, :], axis=1)
     return at(origin), jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
-
-
-def _undefined(system: type[AbstractElements], pose: RelativePose, length) -> Bool[Array, ""]:
-    """Whether the named elements do not exist at this pose, or not with this base."""
-    if system is DependentElements:
-        return (jnp.abs(pose.bx) < 1e-6) | ~(jnp.isfinite(length) & (length != 0))
-    if system is IndependentElements:
-        return (rot.length(pose.bx, pose.by) < 1e-6) | ~(jnp.isfinite(length) & (length > 0))
-    return jnp.zeros_like(pose.bx, bool)
 
 
 def _wrong_side(system: type[AbstractElements], base: ArrayLike | None, pose: RelativePose) -> Bool[Array, ""]:

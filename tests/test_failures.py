@@ -1,48 +1,13 @@
-"""Never a silent wrong answer: every way a pair can fail has a result with advice, and leaves its neighbours alone."""
+"""Never a silent wrong answer: every layout that cannot be oriented has a result with advice."""
 
-from functools import lru_cache
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 import pytest
+from mock_photos import FOCAL, block, in_any_position, name, outcome, photographed
 
 import jaxro
-from jaxro import RESULTS, DependentElements, IndependentElements, RelativePose, degeneracy, simulation
-
-FOCAL = 150.0
-
-
-@lru_cache
-def turned(turn):
-    """Wolf's matrix of (omega, phi, kappa)."""
-    return np.asarray(jaxro.rotations.as_array(jaxro.rotations.m_omega_phi_kappa(*(jnp.asarray(a) for a in turn))))
-
-
-def photographed(points, turn=(0.0, 0.0, 0.0), base=(1.0, 0.0, 0.0), sigma=0.0, seed=0):
-    """Photos of points (n, 3) given in bases, left photo at the origin looking along -z, right one turned (Wolf)."""
-    points = np.asarray(points, float)
-    left, right = points, (points - np.asarray(base)) @ turned(turn).T
-    noise = np.random.default_rng(seed).normal(size=(4, len(points))) * sigma
-    coordinates = [-FOCAL * left[:, 0] / left[:, 2], -FOCAL * left[:, 1] / left[:, 2]]
-    coordinates += [-FOCAL * right[:, 0] / right[:, 2], -FOCAL * right[:, 1] / right[:, 2]]
-    return jaxro.pair(*(np.asarray(coordinates) + noise), focal=FOCAL)
-
-
-def block(n=12, seed=1, depth=(1.5, 2.2)):
-    rng = np.random.default_rng(seed)
-    return np.column_stack([rng.uniform(-0.2, 1.2, n), rng.uniform(-1, 1, n), -rng.uniform(*depth, n)])
-
-
-def outcome(pair, **options):
-    """Up to 20 points share one compiled program."""
-    return jaxro.orient(jaxro.pad(pair, max(20, len(pair.x_left))), **options)
-
-
-def name(orientation):
-    return next(key for key, member in RESULTS._name_to_item.items() if bool(orientation.result == member))
+from jaxro import RESULTS, DependentElements, degeneracy
 
 
 def test_every_result_has_advice():
@@ -157,21 +122,6 @@ def test_plane_has_two_solutions():
     assert name(outcome(photographed(relief, turn=(0.1, -0.2, 0.9), sigma=0.005))) == "successful"
 
 
-def in_any_position(points, count, seed, sigma):
-    """`count` pairs of such points (rng -> (n, 3), in bases): photos in any position, the mean point ahead of both."""
-    rng, pairs, truth = np.random.default_rng(seed), [], []
-    while len(pairs) < count:
-        ground, base = points(rng), rng.normal(size=3)
-        base /= np.linalg.norm(base)
-        turn = rng.uniform(-1, 1, 2) * 0.5, rng.uniform(-np.pi, np.pi)
-        right = (ground - base) @ turned((*turn[0], turn[1])).T
-        if np.all(right[:, 2] < -0.5):
-            both = [-FOCAL * p[:, k] / p[:, 2] for p in (ground, right) for k in (0, 1)]
-            pairs.append(np.array(both) + rng.normal(size=(4, len(ground))) * sigma)
-            truth.append(base)
-    return np.stack(pairs, axis=1), np.stack(truth)
-
-
 @pytest.mark.parametrize("count", [8, 12, 20])
 def test_points_in_a_plane_do_not_say_which_of_two_orientations_is_right(count):
     """A plane in any position: both fit as well but for chance, so that hardly one is to be taken for certain."""
@@ -231,124 +181,3 @@ def test_point_behind_a_photo():
     found = outcome(photographed(points))
     assert name(found) == "points_behind_camera"
     np.testing.assert_array_equal(np.asarray(found.in_front)[:12], np.arange(12) != 3)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_non_finite_input(bad):
-    good = photographed(block(12), sigma=0.01)
-    broken = jaxro.pair(good.x_left.at[4].set(bad), good.y_left, good.x_right, good.y_right, focal=FOCAL)
-    found = outcome(broken)
-    assert name(found) == "non_finite_input"
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
-    without = outcome(good.with_mask(jnp.arange(12) != 4))
-    np.testing.assert_allclose(found.pose.quaternion, without.pose.quaternion, atol=1e-14)
-
-
-@pytest.mark.parametrize("focal", [0.0, -150.0, np.nan])
-def test_impossible_focal_length(focal):
-    good = photographed(block(12))
-    assert name(outcome(jaxro.pair(*good.coordinates, focal=focal))) == "non_finite_input"
-
-
-def test_swapped_photos_show_in_the_sign_of_the_base():
-    pair = photographed(block(12), sigma=0.005)
-    swapped = jaxro.swapped(pair)
-    assert name(outcome(pair, elements=DependentElements, base=90.0)) == "successful"
-    assert name(outcome(swapped, elements=DependentElements, base=90.0)) == "photos_swapped"
-    assert name(outcome(swapped, elements=DependentElements, base=-90.0)) == "successful"
-    assert float(outcome(swapped).pose.bx) < -0.99
-
-
-def test_elements_that_do_not_exist():
-    forward = photographed(block(14, depth=(3.0, 6.0)) - [0.5, 0, 0], base=(0.0, 0.0, -1.0))
-    assert name(outcome(forward)) == "successful"
-    assert name(outcome(forward, elements=DependentElements, base=1.0)) == "elements_undefined"
-    assert name(outcome(forward, elements=IndependentElements)) == "elements_undefined"
-
-
-def test_nonsense_coordinates_are_not_called_an_orientation():
-    rng = np.random.default_rng(8)
-    found = outcome(jaxro.pair(*rng.uniform(-100, 100, (4, 20)), focal=FOCAL))
-    assert not bool(found.usable)
-
-
-@pytest.mark.parametrize("size", [1e12, 1e160, 1e280])
-def test_numbers_out_of_all_proportion_are_no_measurements(size):
-    """Their squares are infinite, and what is divided by them nothing."""
-    pair = photographed(block())
-    for spoiled in ("x_left", "y_right", "sigma", "focal_right"):
-        value = getattr(pair, spoiled)
-        value = value.at[3].set(size * 1e20) if value.ndim else value * size * 1e20
-        worse = eqx.tree_at(lambda p, spoiled=spoiled: getattr(p, spoiled), pair, value)
-        assert name(outcome(worse)) == "non_finite_input"
-
-
-def test_a_base_that_is_no_length_gives_no_elements():
-    pair = photographed(block())
-    for base in (0.0, np.nan, np.inf):
-        assert name(outcome(pair, elements=DependentElements, base=base)) == "elements_undefined"
-    assert name(outcome(pair, elements=IndependentElements, base=-3.0)) == "elements_undefined"
-
-
-def test_no_points_at_all():
-    assert name(jaxro.orient(jaxro.pair([], [], [], [], focal=1.0))) == "too_few_points"
-
-
-def test_single_precision_is_adjusted_in_double_or_refused():
-    pair = photographed(block(), sigma=0.01)
-    single = jax.tree.map(lambda a: a if a.dtype == bool else a.astype(jnp.float32), pair)
-    found = outcome(single)
-    assert name(found) == "successful" and found.sigma0.dtype == jnp.float64
-    many = jax.tree.map(lambda a: np.asarray(a)[None], single)
-    np.testing.assert_allclose(jaxro.orient_batch(many, select=lambda o: o.sigma0)[0], found.sigma0, rtol=1e-9)
-    with jax.enable_x64(False), pytest.raises(ValueError, match="double precision"):
-        jaxro.orient(single)
-
-
-def test_duplicate_points_do_not_make_a_layout():
-    """Six rows, but only four different points."""
-    found = outcome(photographed(np.concatenate([block(4), block(4)[:2]])))
-    assert not bool(found.usable)
-
-
-def test_wrong_arguments_raise_before_anything_is_traced():
-    with pytest.raises(ValueError, match="all four must agree"):
-        jaxro.pair([1.0, 2.0], [1.0], [1.0, 2.0], [1.0, 2.0], focal=FOCAL)
-    with pytest.raises(ValueError, match="orient_batch"):
-        jaxro.orient(jaxro.stack([photographed(block())]))
-    with pytest.raises(ValueError, match="batch of pairs"):
-        jaxro.orient_batch(photographed(block()))
-    with pytest.raises(ValueError, match="focal must be a positive"):
-        jaxro.Camera(focal=-1.0)
-
-
-def test_a_failing_neighbour_changes_no_bit():
-    good = [photographed(block(12, seed=s), turn=(0.01, 0.02, -0.01), sigma=0.01, seed=s) for s in range(6)]
-    bad = [
-        photographed(block(12), base=(0.0, 0.0, 0.0)),
-        good[0].with_mask(jnp.arange(12) < 3),
-        jaxro.pair(good[0].x_left.at[0].set(jnp.nan), *good[0].coordinates[1:], focal=FOCAL),
-        jaxro.pair(*np.random.default_rng(1).uniform(-90, 90, (4, 12)), focal=FOCAL),
-    ]
-    program = problems.jit(jax.vmap(jaxro.orient))
-    alone = program(jaxro.stack([*good, *good[:4]]))
-    beside = program(jaxro.stack([*good, *bad]))
-    for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(beside), strict=True):
-        np.testing.assert_array_equal(np.asarray(a)[:6], np.asarray(b)[:6])
-    slope = problems.jit(jax.grad(lambda pairs: jnp.sum(jax.vmap(jaxro.orient)(pairs).pose.qx[:6]), allow_int=True))
-    np.testing.assert_array_equal(
-        slope(jaxro.stack([*good, *good[:4]])).x_left[:6], slope(jaxro.stack([*good, *bad])).x_left[:6]
-    )
-
-
-def test_results_of_a_batch_say_which():
-    pairs = jaxro.stack([photographed(block(12)), photographed(block(12)).with_mask(jnp.arange(12) < 4)])
-    found = jaxro.orient_batch(pairs, elements=RelativePose)
-    np.testing.assert_array_equal(np.asarray(found.usable), [True, False])
-    with pytest.raises(RuntimeError, match="1 of 2"):
-        found.check()
-
-
-def test_simulated_standard_layout_without_two_zones():
-    layout = simulation.standard_layout(6)
-    assert len(layout.x) == 6

@@ -1,0 +1,56 @@
+"""Photos of given points, for tests of what cannot be oriented."""
+
+from functools import lru_cache
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxro
+from jaxro import RESULTS
+
+FOCAL = 150.0
+
+
+@lru_cache
+def turned(turn):
+    """Wolf's matrix of (omega, phi, kappa)."""
+    return np.asarray(jaxro.rotations.as_array(jaxro.rotations.m_omega_phi_kappa(*(jnp.asarray(a) for a in turn))))
+
+
+def photographed(points, turn=(0.0, 0.0, 0.0), base=(1.0, 0.0, 0.0), sigma=0.0, seed=0):
+    """Photos of points (n, 3) given in bases, left photo at the origin looking along -z, right one turned (Wolf)."""
+    points = np.asarray(points, float)
+    left, right = points, (points - np.asarray(base)) @ turned(turn).T
+    noise = np.random.default_rng(seed).normal(size=(4, len(points))) * sigma
+    coordinates = [-FOCAL * left[:, 0] / left[:, 2], -FOCAL * left[:, 1] / left[:, 2]]
+    coordinates += [-FOCAL * right[:, 0] / right[:, 2], -FOCAL * right[:, 1] / right[:, 2]]
+    return jaxro.pair(*(np.asarray(coordinates) + noise), focal=FOCAL)
+
+
+def block(n=12, seed=1, depth=(1.5, 2.2)):
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-0.2, 1.2, n), rng.uniform(-1, 1, n), -rng.uniform(*depth, n)])
+
+
+def outcome(pair, **options):
+    """Up to 20 points share one compiled program."""
+    return jaxro.orient(jaxro.pad(pair, max(20, len(pair.x_left))), **options)
+
+
+def name(orientation):
+    return next(key for key, member in RESULTS._name_to_item.items() if bool(orientation.result == member))
+
+
+def in_any_position(points, count, seed, sigma):
+    """`count` pairs of such points (rng -> (n, 3), in bases): photos in any position, the mean point ahead of both."""
+    rng, pairs, truth = np.random.default_rng(seed), [], []
+    while len(pairs) < count:
+        ground, base = points(rng), rng.normal(size=3)
+        base /= np.linalg.norm(base)
+        turn = rng.uniform(-1, 1, 2) * 0.5, rng.uniform(-np.pi, np.pi)
+        right = (ground - base) @ turned((*turn[0], turn[1])).T
+        if np.all(right[:, 2] < -0.5):
+            both = [-FOCAL * p[:, k] / p[:, 2] for p in (ground, right) for k in (0, 1)]
+            pairs.append(np.array(both) + rng.normal(size=(4, len(ground))) * sigma)
+            truth.append(base)
+    return np.stack(pairs, axis=1), np.stack(truth)
