@@ -258,7 +258,7 @@ def heights(
     """Heights over a grid of squares from parallaxes.
 
     With standard deviations, adjusted over the traverses between points, whose misclosures are tested.
-    Exit code 0: done; 1: a traverse has a wrong leg; 2: bad input, nothing written.
+    Exit code 0: done; 1: a wrong leg, or a known height that is not what is read there; 2: bad input, nothing written.
     """
     from .io.height_job import Options, run
 

@@ -2,8 +2,9 @@
 
 Errors are those of exact propagation through `heights` at the planned geometry. In traverses the points are read anew
 for each leg, the grid once in each square, as `surveys` takes it: of a leg only the readings of its points add up.
-Errors of the squares and of the grid enter both legs that meet in a point, and cancel except at the ends. The paper's
-(13) and (16), in `height_accuracy`, let everything add up.
+Errors of the squares and of the grid enter both legs that meet in a point, and cancel except at the ends. The error of
+the camera height enters for one step of height; the middle of a traverse that leads down and up again is worse by up to
+an eighth. The paper's (13) and (16), in `height_accuracy`, let everything add up.
 """
 
 from collections.abc import Callable
@@ -61,7 +62,8 @@ class Deviations(NamedTuple):
 
 class Expected(NamedTuple):
     """Standard deviations: of a height over the grid (1); of the difference to a neighbour in the next square (5), and
-    in the same square (19); of the middle of a traverse (13), a node (16), and a point read from that middle (20)."""
+    in the same square (19); of the middle of a traverse (13), a node (16), and a point read from that middle (20). NaN
+    is the middle of a single leg, both ends of which are known."""
 
     height: Number
     difference: Number
@@ -115,19 +117,23 @@ def expected(plan: Plan, deviations: Deviations) -> Expected:
     legs, traverses = jnp.asarray(plan.legs, float), jnp.asarray(plan.traverses, float)
     read = between.parts[1].point ** 2 + between.parts[2].point ** 2
     ends = between.deviation**2 - read  # of two points; from two known ones, or k, that of these is divided
-    middle = root(read * legs / 4 + ends * (1 + 1 / 2) / 2)
+    middle = jnp.where(legs > 1, root(read * legs / 4 + ends * (1 + 1 / 2) / 2), jnp.nan)
     return Expected(
         height_budget(plan, deviations).deviation,
         between.deviation,
         in_square,
         middle,
         root(read * legs / traverses + ends * (1 + 1 / traverses) / 2),
-        root(middle**2 + in_square**2),
+        jnp.where(legs > 1, root(jnp.where(legs > 1, middle, 0.0) ** 2 + in_square**2), jnp.nan),
     )
 
 
 POINTS = 400
 HALVINGS = 60
+SHORTEST_BASE = LARGEST_BASE / 1000
+"""Of the camera height: no shorter base is looked at."""
+HIGHEST = 20.0
+"""Times the camera height of the plan: none higher is looked at."""
 
 
 def least(error: Callable[[Number], Number], wanted: ArrayLike, low: ArrayLike, high: ArrayLike) -> Number:
@@ -160,16 +166,16 @@ def _outermost(error, wanted, begin, end) -> Number:
 
 def base_needed(plan: Plan, deviations: Deviations, wanted: ArrayLike, of: Callable[[Expected], Number]) -> Number:
     """The shortest base that gives this quantity the wanted standard deviation, at most a quarter of the camera height;
-    infinite where not even that does."""
-    most = LARGEST_BASE * jnp.asarray(plan.camera_height, float)
+    infinite where not even that does. None below SHORTEST_BASE is looked at."""
+    camera_height = jnp.asarray(plan.camera_height, float)
     error = lambda base: of(expected(plan._replace(base=base), deviations))
-    return least(error, wanted, most / 1000, most)
+    return least(error, wanted, SHORTEST_BASE * camera_height, LARGEST_BASE * camera_height)
 
 
 def camera_height_allowed(
     plan: Plan, deviations: Deviations, wanted: ArrayLike, of: Callable[[Expected], Number], *, fixed_ratio: bool
 ) -> Number:
-    """The largest camera height, up to 20 times that of the plan, at which this quantity has the wanted standard
+    """The largest camera height, up to HIGHEST times that of the plan, at which this quantity has the wanted standard
     deviation, with the base of the plan (then not below four bases) or (`fixed_ratio`) its H : B; 0 where none has.
 
     A height over the grid has a best camera height: below it the error of H grows, above it that of the readings.
@@ -181,4 +187,4 @@ def camera_height_allowed(
         base = ratio * camera_height if fixed_ratio else plan.base
         return of(expected(plan._replace(camera_height=camera_height, base=base), deviations))
 
-    return largest(error, wanted, now / 20 if fixed_ratio else plan.base / LARGEST_BASE, 20 * now)
+    return largest(error, wanted, now / HIGHEST if fixed_ratio else plan.base / LARGEST_BASE, HIGHEST * now)

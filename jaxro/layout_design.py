@@ -98,6 +98,7 @@ class AbstractCriterion(eqx.Module):
     """What a layout should make small: the largest of some positive numbers, or else their root mean square."""
 
     largest: eqx.AbstractClassVar[bool]
+    fewest: eqx.AbstractClassVar[int]
 
     @abc.abstractmethod
     def values(self, plan: Plan) -> Float[Array, "value"]:
@@ -117,6 +118,7 @@ class Determinant(AbstractCriterion):
     their ellipsoid (D-optimal). Its best layout is the same in every system of elements."""
 
     largest: ClassVar[bool] = False
+    fewest: ClassVar[int] = 5
 
     def values(self, plan):
         n = plan.adjustment.normal_matrix
@@ -129,6 +131,7 @@ class Trace(AbstractCriterion):
     where not all elements are angles."""
 
     largest: ClassVar[bool] = False
+    fewest: ClassVar[int] = 5
 
     def values(self, plan):
         return jnp.sqrt(jnp.diagonal(plan.adjustment.cofactor))
@@ -139,6 +142,7 @@ class DetectableError(AbstractCriterion):
     x_right, y_right."""
 
     largest: ClassVar[bool] = True
+    fewest: ClassVar[int] = 6
     coordinates: tuple[int, ...] = (1, 3)
     delta0: ArrayLike = DELTA0
 
@@ -155,6 +159,7 @@ class HeightDeviation(AbstractCriterion):
     heights."""
 
     largest: ClassVar[bool] = True
+    fewest: ClassVar[int] = 5
     grid: int = 5
 
     def values(self, plan):
@@ -179,7 +184,8 @@ def detectable_errors(pair: Pair, adjustment: Adjustment, delta0: ArrayLike = DE
         b = jax.grad(coplanarity.condition, argnums=1)(f, point)
         d = sum(e**2 for e in b)
         own = [r * e**2 / d for e in b]
-        return [delta0 * sigma / jnp.sqrt(jnp.where(e > 1e-16, e, 1e-16)) for e in own]
+        checked = lambda e: (e > 1e-16) & (r < 1 + 1e-6)  # beyond that nothing is determined at all
+        return [delta0 * sigma / jnp.sqrt(jnp.where(checked(e), e, 1e-16)) for e in own]
 
     return jax.vmap(one)(pair.coordinates, pair.sigma, adjustment.redundancy)  # pyright: ignore[reportReturnType]
 
@@ -243,6 +249,12 @@ def design(
     good. `start`: positions (x, y) to begin with before those. `kept`: positions of further points that stay where they
     are and come last in the result.
     """
+    whole = points + (0 if kept is None else np.size(kept[0]))
+    if whole < criterion.fewest:
+        raise ValueError(f"design: {whole} points, where {criterion.fewest} are the fewest, with those kept")
+    for axis, side in (("x", overlap.x), ("y", overlap.y)):
+        if not traced(side) and not 0 < np.ptp(np.asarray(side, float)) < np.inf:
+            raise ValueError(f"design: the overlap has {axis} = {side}; it must be an interval")
     number = lambda a: jnp.asarray(a, float) if isinstance(a, float | np.ndarray) else a
     arguments = {"criterion": criterion, "overlap": overlap, "sigma": sigma, "start": start, "kept": kept}
     arguments = {name: jax.tree.map(number, a) for name, a in arguments.items()}

@@ -64,7 +64,7 @@ class SoftL1(AbstractLoss):
     scale: float = 1.0
 
     def rho(self, s):
-        return 2 * self.scale**2 * (jnp.sqrt(1 + s / self.scale**2) - 1)
+        return 2 * s / (1 + jnp.sqrt(1 + s / self.scale**2))  # without a difference of nearly equal numbers
 
 
 class Cauchy(AbstractLoss):
@@ -91,8 +91,8 @@ class Tukey(AbstractLoss):
     scale: float = 4.685
 
     def rho(self, s):
-        left = 1 - jnp.minimum(s / self.scale**2, 1.0)
-        return self.scale**2 / 3 * (1 - left**3)
+        t = jnp.minimum(s / self.scale**2, 1.0)
+        return self.scale**2 * t * (1 - t + t * t / 3)
 
 
 class LeastAbsolute(AbstractWeight):

@@ -101,6 +101,8 @@ def mock_survey(scene: Scene, deviations: Measured) -> Mock:
 
     `deviations`: of what will be measured; add errors with `noisy`.
     """
+    if min(scene.columns, scene.rows) < 2:
+        raise ValueError(f"mock_survey: {scene.columns} columns and {scene.rows} rows; traverses need two of each")
     squares = [(i, j) for j in range(scene.rows) for i in range(scene.columns)]
     rng = np.random.default_rng(1982)
     place = lambda low, high: [scene.side * (np.array(s) + rng.uniform(low, high, 2)) for s in squares]

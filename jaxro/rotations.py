@@ -104,10 +104,14 @@ def r_chi(angle: Scalar) -> Matrix:
 
 
 def alpha_omega_chi(r: Matrix) -> Vector:
-    """Angles of R = R_alpha R_omega R_chi; |omega| <= pi/2."""
+    """Angles of R = R_alpha R_omega R_chi; |omega| <= pi/2.
+
+    chi is that of R_alphaᵀ R: near |omega| = pi/2 alpha is any angle, and chi has to go with it.
+    """
     alpha = jnp.arctan2(-r[0][2], r[2][2])
     omega = jnp.arctan2(-r[1][2], length(r[1][0], r[1][1]))
-    chi = jnp.arctan2(r[1][0], r[1][1])
+    c, s = jnp.cos(alpha), jnp.sin(alpha)
+    chi = jnp.arctan2(-c * r[0][1] - s * r[2][1], c * r[0][0] + s * r[2][0])
     return alpha, omega, chi
 
 
@@ -121,10 +125,14 @@ def m_omega_phi_kappa(omega: Scalar, phi: Scalar, kappa: Scalar) -> Matrix:
 
 
 def omega_phi_kappa(m: Matrix) -> Vector:
-    """Angles of M = R3(kappa) R2(phi) R1(omega); |phi| <= pi/2."""
+    """Angles of M = R3(kappa) R2(phi) R1(omega); |phi| <= pi/2.
+
+    kappa is that of M R1(omega)ᵀ: near |phi| = pi/2 omega is any angle, and kappa has to go with it.
+    """
     omega = jnp.arctan2(-m[2][1], m[2][2])
     phi = jnp.arctan2(m[2][0], length(m[0][0], m[1][0]))
-    kappa = jnp.arctan2(-m[1][0], m[0][0])
+    c, s = jnp.cos(omega), jnp.sin(omega)
+    kappa = jnp.arctan2(c * m[0][1] + s * m[0][2], c * m[1][1] + s * m[1][2])
     return omega, phi, kappa
 
 

@@ -115,10 +115,11 @@ def _estimate(data: tuple[Pair, Orientation], *, labels: tuple[Array, ...], size
         theta, _ = state
         f, q = _unpacked(equations(theta), size)
         new = solved(f, q, one * pooled, prior)
-        # the others have to know that these are zero and not negative
-        out = new < least
-        new = solved(f, q, jnp.where(out, least, pooled), prior + jnp.where(out, 1e9 * jnp.diagonal(f), 0.0))
-        new = jnp.where(new > least, new, least)
+        # a variance that comes out too small falls tenfold, or steps may run in a circle; the others have to know it
+        low = jnp.maximum(least, 0.1 * theta)
+        out = new < low
+        new = solved(f, q, jnp.where(out, low, pooled), prior + jnp.where(out, 1e9 * jnp.diagonal(f), 0.0))
+        new = jnp.where(new > low, new, low)
         return new, jnp.max(jnp.where(estimable, jnp.abs(new - theta), 0.0)) / safe
 
     theta, change = jax.lax.fori_loop(0, steps, scored, (one * pooled, pooled))

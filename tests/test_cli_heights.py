@@ -134,6 +134,7 @@ BAD = {  # the table, what stands there, what stands there instead, line, column
     "a reading in m": (READINGS, "53.830", "0.05383", 4, "parallax", "no point has the parallax"),
     "no reading": (READINGS, "53.830", "", 4, "parallax", "an empty field"),
     "longer than the world": (READINGS, "53.830", "1e308", 4, "parallax", "'1e308'"),
+    "known height over the cameras": (READINGS, "57,-127.6", "57,5000", 2, "height", "5000.0"),
     "zero parallax": (READINGS, "53.830", "0", 4, "parallax", "a reading of 0"),
     "a word": (READINGS, "53.830", "deep", 4, "parallax", "'deep'"),
     "no reading of the grid": (READINGS, "53.830,55.465", "53.830,", 4, "grid", "no reading of the grid"),
@@ -141,7 +142,7 @@ BAD = {  # the table, what stands there, what stands there instead, line, column
     "point named as a square": (READINGS, "s2,A2", "B1,A2", 3, "point", "'B1'"),
     "square twice": (GRID, "A2,", "A1,", 3, "square", "first on line 2"),
     "side zero": (GRID, "A3,99.9", "A3,0", 4, "side", "'0'"),
-    "side in cm": (GRID, "A3,99.9", "A3,9.99", 4, "photo_side", "a scale of 1:"),
+    "side in cm": (GRID, "A3,99.9", "A3,9.99", 4, "photo_side", "a focal length of 754.9 mm"),
     "photo side zero": (GRID, "5.016", "0", 3, "photo_side", "'0'"),
     "unknown point": (LEGS, "main,s2,s3", "main,s2,q", 3, "to", "'q'"),
     "gap in a traverse": (LEGS, "main,s2,s3", "main,s4,s3", 3, "from", "'s4'"),
@@ -180,12 +181,38 @@ def test_traverses_without_a_known_height_and_options_that_do_not_fit(tables, tm
         (["--grid", tables[1]], "without READINGS.csv"),
         (["--sd", "lens=1"], "camera-height=10"),
         (["--sd", "base=-1"], "'base=-1'"),
+        (["--sd", "base=1", "--sd", "base=2"], "base a second time"),
         (["--sd", "point=0"], "'point=0'"),  # the weights of traverses
         (["--out", tmp_path], "--force"),
         ([tmp_path / "missing.csv", "--grid", tables[1], *CAMERAS], "no file that can be read"),
     ):
         result = run("heights", *options)
         assert result.exit_code == 2 and said in result.stderr and not result.stdout, options
+
+
+def test_a_known_height_that_is_not_what_is_read_there_is_told(tables, tmp_path):
+    """Given 12 mm too high, and read with ± 1.1 mm."""
+    moved = write(tmp_path, example.READINGS.replace("57,-127.6", "57,-115.6"), "moved.csv")
+    told = survey(moved, *tables[1:])
+    assert told.exit_code == 1 and "The height of s1 is given as -115.6 mm, and read as -127." in words(told.stdout)
+    assert "The height of" not in words(survey(*tables).stdout)
+
+
+def test_heights_from_another_zero(tables, tmp_path):
+    """Grid, known heights and cameras 250 m higher: heights 250 m higher, to the rounding of their numbers."""
+    lift = lambda text: re.sub(r"(?m)(-[\d.]+)$", lambda m: f"{250_000 + float(m[1]):.1f}", text)
+    readings = write(tmp_path, lift(example.READINGS), "high.csv")
+    grid = re.sub(r"(?m)$", ",250000", example.GRID.strip()).replace("photo_side,250000", "photo_side,height")
+    high = write(tmp_path, grid + "\n", "high_grid.csv")
+    options = "--grid", high, "--traverses", tables[2], "--base", "375"
+    assert run("heights", readings, *options, "--camera-height", "251505", "--out", tmp_path / "high").exit_code == 0
+    assert survey(*tables, "--out", tmp_path / "low").exit_code == 0
+    one, other = (rows(tmp_path / name / "heights.csv") for name in ("high", "low"))
+    for column, zero in (("height_mm", 250_000), ("sd_mm", 0), ("over_grid_mm", 250_000)):
+        a, b = (np.array([float(row[column]) for row in table]) for table in (one, other))
+        np.testing.assert_allclose(a - zero, b, atol=1e-6)
+    wrong = run("heights", readings, *options, "--camera-height", "1505")
+    assert wrong.exit_code == 2 and "line 2, column height" in wrong.stderr and "from the same zero" in wrong.stderr
 
 
 def test_a_plan_is_told_and_answers_backwards():
@@ -201,6 +228,14 @@ def test_a_plan_is_told_and_answers_backwards():
     )
 
 
+def test_what_no_limit_was_found_for_is_not_told_as_one():
+    plan = "plan", "--camera-height", 500, "--depth", 50, "--step", 5, "--of", "in-square", "--want"
+    assert "with this H:B of 4.0 even 20 times the camera height" in words(run(*plan, 8).stdout)
+    assert "any base, even of 0.125 mm" in words(run(*plan, 1e9).stdout)
+    told = words(run("plan", "--legs", 1).stdout)
+    assert "the middle of a traverse of 1 legs (13) - -" in told
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -212,6 +247,7 @@ def test_a_plan_is_told_and_answers_backwards():
         (["--depth", "3000"], "--depth"),
         (["--focal", "0"], "--focal"),
         (["--side", "1e-300"], "a positive length in mm"),
+        (["--sd", "point=1e-200"], "'point=1e-200'"),
     ],
 )
 def test_plans_that_cannot_be_say_so(options, said):

@@ -29,6 +29,8 @@ def test_student():
 def test_chi_squared():
     level, freedom = GRID
     np.testing.assert_allclose(critical.chi_squared(level, freedom), stats.chi2.isf(level, freedom), rtol=1e-9)
+    level, freedom = (a.ravel() for a in np.meshgrid([1e-20, 1e-50, 1e-100, 0.999], [1.0, 5.0, 1000.0]))
+    np.testing.assert_allclose(critical.chi_squared(level, freedom), stats.chi2.isf(level, freedom), rtol=1e-9)
 
 
 def test_chi_squared_bounds():

@@ -108,6 +108,17 @@ def test_never_worse_than_the_start(criterion):
     assert result.value < 0.95 * result.before[0]
 
 
+@pytest.mark.parametrize(
+    ("criterion", "points", "kept"), [(design.Determinant(), 4, 0), (design.DetectableError(), 3, 2)]
+)
+def test_too_few_points_are_no_layout(criterion, points, kept):
+    there = (np.zeros(kept), np.zeros(kept)) if kept else None
+    with pytest.raises(ValueError, match="are the fewest"):
+        design.design(criterion, box(), points, jax.random.key(0), kept=there)
+    with pytest.raises(ValueError, match=r"y = \(10, 10\)"):
+        design.design(criterion, design.Overlap((0, 70), (10, 10), SIDE, SIDE), 8, jax.random.key(0))
+
+
 def test_accuracy_is_that_of_the_textbook():
     (x, y), lanes = random_positions(1), (37, 9)
     pair = design.photographed(box(TILTED, hills), (x, y), SIGMA)

@@ -31,6 +31,12 @@ def drawn(mock):
     return np.asarray(found.value) - mock.truth, np.asarray(found.over_grid) - mock.truth, np.asarray(found.misclosure)
 
 
+@pytest.mark.parametrize("size", [(1, 1), (2, 1), (1, 3)])
+def test_a_scene_without_traverses_is_told(size):
+    with pytest.raises(ValueError, match="two of each"):
+        mock_surveys.mock_survey(SCENE._replace(columns=size[0], rows=size[1]), SD)
+
+
 def test_without_errors_heights_are_the_truth():
     """Vertical photos without distortion to the last digit; tilted and distorted ones to a tenth of what readings cost,
     if the grid is read at the point, and to a third where it is read at the nearest side."""

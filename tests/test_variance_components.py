@@ -60,6 +60,17 @@ def within_two(found, truth):
         )
 
 
+def test_steps_do_not_run_in_a_circle():
+    """Three classes 1 : 3 : 9 in thirty pairs, where the first steps make the small variance negative."""
+    classes, truth = np.arange(16) % 3, np.array([0.005, 0.015, 0.045])
+    for seed in range(40):
+        pairs, found = batch(NEAR, np.broadcast_to(truth[classes], (4, 16)), 30, seed)
+        result = components.estimate(pairs, found, (classes,) * 4)
+        assert bool(result.converged) and bool(result.estimable[1] & result.estimable[2])
+        np.testing.assert_allclose(result.sigma[1:], truth[1:], rtol=0.4)
+        assert abs(float(result.sigma[0]) ** 2 - truth[0] ** 2) < 4 * float(result.variance_error[0])
+
+
 def test_classes_of_points_in_near_vertical_pairs():
     pairs, found = batch(NEAR, by_class(), 2_000)
     groups = (CLASSES.astype(int),) * 4

@@ -120,7 +120,8 @@ TraverseTable = Annotated[
     ),
 ]
 CameraHeight = Annotated[
-    float | None, typer.Option(help="Of both cameras over the grid, mm.", metavar="H", show_default=False)
+    float | None,
+    typer.Option(help="Of both cameras over the zero of heights (the grid), mm.", metavar="H", show_default=False),
 ]
 HorizontalBase = Annotated[
     float | None, typer.Option(help="Horizontal distance of the cameras, mm.", metavar="B", show_default=False)

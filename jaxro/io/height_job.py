@@ -54,7 +54,7 @@ def run(options: Options) -> bool:
             "--camera-height H --base B",
             markup=False,
         )
-    return not done.suspicious
+    return not (done.suspicious or done.doubtful)
 
 
 def prepared(options: Options) -> Named:
@@ -85,10 +85,15 @@ def prepared(options: Options) -> Named:
 
 def positive(option: str, value: float | None) -> float:
     """The value. Raises TableError unless it is a length."""
-    if value is None or not 1 / tables.LONGEST <= value <= tables.LONGEST:
+    if value is None or not in_bounds(value):
         found = "no value" if value is None else repr(value)
         raise TableError(option, None, None, found, "a positive length in mm")
     return value
+
+
+def in_bounds(value: float) -> bool:
+    """Whether it is a length."""
+    return 1 / tables.LONGEST <= value <= tables.LONGEST
 
 
 def deviations_of(given: list[str]) -> Deviations:
@@ -101,9 +106,11 @@ def deviations_of(given: list[str]) -> Deviations:
             value = float(number)
         except ValueError:
             value = math.nan
-        if name not in names or not (math.isfinite(value) and (value > 0 or (value == 0 and name != "point"))):
+        if name not in names or not (in_bounds(value) or (value == 0 and name != "point")):
             defaults = ", ".join(f"{n}={Deviations._field_defaults[f]:g}" for n, f in names.items())
             raise TableError("--sd", None, None, repr(text), f"NAME=VALUE in mm, of which the defaults are {defaults}")
+        if names[name] in values:
+            raise TableError("--sd", None, None, f"{name} a second time", "each standard deviation once")
         values[names[name]] = value
     return Deviations(**values)
 

@@ -56,7 +56,7 @@ def run(options: Options) -> bool:
     )
     rows = table("expected standard deviation of", "mm", "H / m")
     for what, value in zip(named(options), told, strict=True):
-        rows.add_row(what, number(value, 2), number(options.camera_height / value, 0))
+        rows.add_row(what, number(value, 2), number(options.camera_height / value if value else np.inf, 0))
     console.print(rows)
     console.print(_budget(plan, deviations))
     if options.want is not None:
@@ -133,12 +133,18 @@ def _needed(options: Options, plan: Plan, deviations: Deviations, want: float) -
         )
         raise TableError("--want", None, None, f"{what}, which no base and no camera height gives", expected)
     lines = [f"For {what}:"]
-    if np.isfinite(base):
+    if base <= (shortest := planning.SHORTEST_BASE * options.camera_height) * (1 + 1e-9):
+        lines.append(f"  at this camera height any base, even of {shortest:.3g} mm")
+    elif np.isfinite(base):
         lines.append(
             f"  at this camera height a base of at least {base:.0f} mm (H:B {options.camera_height / base:.1f})"
         )
     else:
         lines.append(f"  at this camera height no base: the largest, {longest:g} mm, gives ± {best:.2f} mm")
     for text, value in highest.items():
-        lines.append(f"  {text} a camera height of at most {value:.0f} mm" if value else f"  {text} no camera height")
+        if value >= planning.HIGHEST * options.camera_height * (1 - 1e-9):
+            told = f"even {planning.HIGHEST:g} times the camera height"
+        else:
+            told = f"a camera height of at most {value:.0f} mm" if value else "no camera height"
+        lines.append(f"  {text} {told}")
     return lines

@@ -59,8 +59,9 @@ def _traverses(console: Console, done: Done) -> None:
         return
     for c in done.closures:
         allowed = float(done.found.limit) * c.deviation
+        legs = "1 leg" if c.legs == 1 else f"{c.legs} legs"
         console.print(
-            f"Traverse {escape(c.name)}, {c.legs} legs, closes with {number(c.misclosure, 2)} mm "
+            f"Traverse {escape(c.name)}, {legs}, closes with {number(c.misclosure, 2)} mm "
             f"(± {number(c.deviation, 2)} by its readings, allowed {number(allowed, 2)})"
         )
     rows = table(
@@ -106,6 +107,15 @@ def _mind(console: Console, done: Done) -> None:
             f"[red]Mind:[/red] Traverse {escape(named)} has |w| = {worst_w:.1f} where "
             f"{float(done.found.limit):.2f} is allowed: one of its legs is wrong by some {sizes} mm, the misclosure "
             f"cannot tell which. Read them again.{also}"
+        )
+    for i in done.doubtful:
+        height, read, sd = (
+            float(a[i])
+            for a in (done.found.heights.value, done.found.heights.over_grid, done.found.deviations.over_grid)
+        )
+        console.print(
+            f"[red]Mind:[/red] The height of {escape(done.named.names[i])} is given as {height:.1f} mm, and read as "
+            f"{read:.1f} ± {sd:.1f} mm."
         )
     unchecked = [f"{t.names} ({t.first} - {t.last})" for t in done.traverses if not np.isfinite(t.detectable)]
     if unchecked:

@@ -13,6 +13,9 @@ from . import files
 from .fields import TableError
 from .height_tables import Named
 
+DOUBTFUL = 4.0
+"""Standard deviations by which a known height may differ from what is read there."""
+
 
 @dataclass(frozen=True)
 class Traverse:
@@ -55,6 +58,16 @@ class Done:
     origin: list[str]
 
     @property
+    def doubtful(self) -> list[int]:
+        """Points whose known height is not what is read there."""
+        known = np.asarray(self.named.survey.known)[: self.named.points]
+        given, read, sd = (
+            np.asarray(a)[: self.named.points]
+            for a in (self.found.heights.value, self.found.heights.over_grid, self.found.deviations.over_grid)
+        )
+        return np.flatnonzero(known & (np.abs(given - read) > DOUBTFUL * sd)).tolist()
+
+    @property
     def suspicious(self) -> list[Traverse]:
         """Traverses beyond the limit, the worst and its equals first."""
         limit = float(self.found.limit)
@@ -66,8 +79,8 @@ def finished(named: Named) -> Done:
     found = jax.tree.map(np.asarray, surveys.solve(named.survey))
     adjusted = found.adjusted
     if adjusted is not None and int(adjusted.result._value) != int(RESULTS.successful._value):
-        advice = RESULTS[adjusted.result] or "no solution"
-        raise TableError("traverses", None, None, advice, "traverses that determine their points")
+        expected = "readings, lengths and standard deviations that are near one another in size"
+        raise TableError("traverses", None, None, "a network without a solution", expected)
     one = jax.tree.map(np.asarray, named.survey)
     levelled, support, origin = set(one.levelled.tolist()), one.support, []
     for i in range(named.points):

@@ -118,8 +118,13 @@ def assembled(
             raise TableError(readings[0], row.line, "grid", "no reading of the grid", expected)
         square.append(k)
         at_grid.add(own if own is not None else there, None if own is not None else k, deviations.grid)
-        _check_reading(readings[0], row, "parallax", at_grid.of(-1), p_c[k], camera_height)
+        over = camera_height - datum[k]
+        _check_reading(readings[0], row, "parallax", at_grid.of(-1), p_c[k], over)
         parallax.append(row.cells["parallax"])
+        known_height = row.cells.get("height")
+        if known_height is not None and not -over < known_height - datum[k] < over / 2:
+            expected = f"a height from the zero of the grid and of the camera height, {camera_height:g}"
+            raise TableError(readings[0], row.line, "height", repr(known_height), expected)
     height = [row.cells.get("height") for row in readings[1]]
     names, count = list(points), len(points)
     start, end, legs = [], [], [] if traverses is None else traverses[1]
@@ -142,7 +147,7 @@ def assembled(
                 parallax.append(at_grid.of(-1))
                 height.append(datum[corner])
             i = points[name]
-            _check_reading(traverses[0], row, reading, at_grid.of(i), p_c[square[i]], camera_height)  # pyright: ignore
+            _check_reading(traverses[0], row, reading, at_grid.of(i), p_c[square[i]], camera_height - datum[square[i]])  # pyright: ignore
             into.append(i)
     known = np.array([h is not None for h in height])
     if traverses is not None:
@@ -213,17 +218,23 @@ def _numbered(file: str, table: list[Row], column: str) -> dict[str, int]:
 
 
 def _check_scale(file: str, grid: list[Row], camera_height: float) -> None:
-    """All squares in one scale, that of a camera."""
-    scale = np.array([row.cells["photo_side"] / row.cells["side"] for row in grid])
-    usual = float(np.median(scale))
-    for row, one in zip(grid, scale, strict=True):
-        if not 1 / SCALE < one / usual < SCALE:
-            found = f"{row.cells['photo_side']!r}, a scale of 1:{1 / one:.4g}"
-            expected = f"lengths in mm like those of the other squares, 1:{1 / usual:.4g}"
-            raise TableError(file, row.line, "photo_side", found, expected)
-    if not FOCAL[0] < usual * camera_height < FOCAL[1]:
-        found = f"a scale of 1:{1 / usual:.4g}, so a focal length of {usual * camera_height:.4g} mm"
-        raise TableError(file, None, "photo_side", found, "side, photo_side and --camera-height all in mm")
+    """All squares below the cameras, and in the scales of one camera."""
+    focal = []
+    for row in grid:
+        datum = row.cells.get("height") or 0.0
+        if datum >= camera_height:
+            expected = f"less than the camera height of {camera_height:g}, which counts from the same zero"
+            raise TableError(file, row.line, "height", repr(datum), expected)
+        focal.append(row.cells["photo_side"] / row.cells["side"] * (camera_height - datum))
+    usual = float(np.median(focal))
+    for row, one in zip(grid, focal, strict=True):
+        if not usual / SCALE < one < usual * SCALE:
+            found = f"{row.cells['photo_side']!r}, so a focal length of {one:.4g} mm"
+            raise TableError(file, row.line, "photo_side", found, f"that of the other squares, {usual:.4g} mm")
+    if not FOCAL[0] < usual < FOCAL[1]:
+        found = f"squares of a photo with a focal length of {usual:.4g} mm"
+        expected = "side, photo_side, --camera-height all in mm, heights and --camera-height from one zero"
+        raise TableError(file, None, "photo_side", found, expected)
 
 
 def _check_reading(file: str, row: Row, column: str, grid: float, p_c: float, camera_height: float) -> None:
