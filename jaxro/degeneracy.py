@@ -4,6 +4,8 @@ Measuring errors hide that elements are undetermined: points that lie on a line 
 normal matrix. Whether it means anything is a question of scale, and the scale is sigma0.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -33,34 +35,68 @@ def in_radians(elements: AbstractElements, cofactor: Float[Array, "5 5"]) -> tup
     return cofactor / (scale[:, None] * scale[None, :]), units
 
 
-def margin(pair: Pair, elements: AbstractElements, cofactor: Float[Array, "5 5"]) -> Float[Array, ""]:
-    """The least change of the coordinates (root mean square over the points, in units of sigma) that leaves one
-    combination of the elements undetermined, to first order.
+class WorstDirection(NamedTuple):
+    """What happens along the worst determined direction of the elements.
+
+    `margin`: the least change of the coordinates (root mean square over the points, in units of sigma) that leaves one
+    combination of the elements undetermined, to first order. And to second order, of another minimum: `away`, its
+    distance in standard deviations of the direction for sigma0 = 1; `turn`, the same in rad; `rise` of Σ r² there.
+    """
+
+    margin: Float[Array, ""]
+    away: Float[Array, ""]
+    turn: Float[Array, ""]
+    rise: Float[Array, ""]
+
+
+def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Array, "5 5"]) -> WorstDirection:
+    """`WorstDirection` of an adjustment with these cofactors of its parameters.
 
     Along the worst determined direction e of the elements g of a point changes by g'. With n points the normal matrix
     has eᵀ N e = Σ (g'/ (sigma |∇g|))², and each coordinate moves g' by ∇g', so that errors of size m alone produce
     m² Σ (|∇g'| / |∇g|)²: the two are equal at m = margin.
+
+    To second order the residuals are r + a t + c t²/2 with a = A e at right angles to all other columns of A. The part
+    of c along a, c.a/a.a, brings them back at t = -2 a.a / c.a; what of c no column takes up, c.c - cᵀA Q Aᵀc, is left
+    as Σ r² + t⁴/4 of it. Layouts near a critical surface, such as a valley along the base on the cylinder through both
+    stations, have there another minimum that the linearised statistics of the first know nothing of.
     """
-    cofactor, units = in_radians(elements, cofactor)
-    direction = stage(_worst)(cofactor)
-    direction = [e * unit for e, unit in zip(direction, units, strict=True)]
-
-    def fundamental(t):
-        moved = elements.moved(tuple(t * e for e in direction))
-        return coplanarity.fundamental_matrix(*moved.relative(), pair.focal_left, pair.focal_right)
-
+    scaled, units = in_radians(elements, cofactor)
+    direction = stage(_worst)(scaled)
+    length = jnp.sqrt(sum((e * e for e in direction), jnp.zeros(())))
+    direction = [e / length * unit for e, unit in zip(direction, units, strict=True)]
     zero = jnp.zeros_like(pair.focal_left)
-    f, slope = jax.jvp(fundamental, (zero,), (jnp.ones_like(zero),))
+
+    def fundamental(*step):
+        return coplanarity.fundamental_matrix(*elements.moved(step).relative(), pair.focal_left, pair.focal_right)
+
+    along = lambda t: fundamental(*(t * e for e in direction))
+    slope_at = lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),))
+    (f, slope), (_, curve) = jax.jvp(slope_at, (zero,), (jnp.ones_like(zero),))
 
     def one(point, sigma, use):
-        _, square, _ = coplanarity.linearised(f, point, use)
-        g, moved, _ = coplanarity.linearised(slope, point, use)
+        _, square, b = coplanarity.linearised(f, point, use)
+        g, moved, turned = coplanarity.linearised(slope, point, use)
         weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
-        return g**2 * weight, moved * sigma**2 * weight
+        bent = coplanarity.condition(curve, point) - 2 * g * sum(x * y for x, y in zip(b, turned, strict=True)) / square
+        # g is linear in F, so that its derivatives by F are products of coordinates
+        x1, y1, x2, y2 = point
+        entries = (x1 * x2, x1 * y2, x1, y1 * x2, y1 * y2, y1, x2, y2, 1.0)
+        terms = g**2 * weight, moved * sigma**2 * weight, bent**2 * weight
+        return *terms, *(bent * weight * entry for entry in entries)
 
-    change, drift = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
+    change, drift, bends, *products = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
     ratio = change / jnp.where(drift > 0, drift, 1.0)
-    return jnp.where(drift > 0, jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0)), jnp.inf)
+    margin = jnp.where(drift > 0, jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0)), jnp.inf)
+
+    _, pull = jax.vjp(fundamental, *(zero,) * 5)
+    columns = pull((tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])))  # Aᵀc
+    taken = sum(columns[i] * cofactor[i, j] * columns[j] for i in range(5) for j in range(5))
+    back = jnp.abs(sum(e * h for e, h in zip(direction, columns, strict=True)))
+    straight = back <= 0
+    t = jnp.where(straight, jnp.inf, 2 * change / jnp.where(straight, 1.0, back))
+    rise = jnp.maximum(bends - taken, 0.0) * t**4 / 4
+    return WorstDirection(margin, t * jnp.sqrt(jnp.maximum(change, 0.0)), t, rise)
 
 
 def _worst(cofactor: Float[Array, "p p"]) -> list:
@@ -89,6 +125,34 @@ def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:
     """Multiple of sigma0 below which parallaxes are explained by a rotation alone: 4, and more where sigma0 itself is
     uncertain."""
     return 4 + 12 / jnp.maximum(freedom, 1.0)
+
+
+CERTAIN = 2.576
+"""Normal quantile, of one in 200, from which the better of two orientations is taken for the right one."""
+
+NEAR = 0.5
+"""rad: further away the second order tells nothing."""
+
+SEPARATE = 12.0
+"""Standard deviations between two minima from which Σ r² between them, (12/4)² sigma0² higher, parts them."""
+
+
+def excess(freedom: Float[Array, ""]) -> Float[Array, ""]:
+    """The ratio of Σ r² of two orientations up to which they are not told apart.
+
+    Where both are right, as they are of points in a plane, it has Fisher's distribution with f = n - 5 degrees of
+    freedom each. Its quantile by his z: ln F is nearly normal with the variance 4 / (f - 1); for f = 1 as it is.
+    """
+    return jnp.where(freedom > 0, jnp.exp(2 * CERTAIN / jnp.sqrt(jnp.maximum(freedom - 1, 0.28))), 1.0)
+
+
+def folded(
+    worst: WorstDirection, freedom: Float[Array, ""], noise: Float[Array, ""]
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether there is a second minimum that fits as well, and whether nothing parts it from the first."""
+    fits = worst.rise < (excess(freedom) - 1) * freedom * noise**2
+    second = fits & (worst.turn < NEAR) & (freedom > 0)
+    return second, second & (worst.away < SEPARATE * noise)
 
 
 def pure_rotation(inspected: Inspection, freedom: Float[Array, ""], noise: Float[Array, ""]) -> Bool[Array, ""]:

@@ -206,16 +206,21 @@ def _inspected(
     result = adjustment.result
     fair = result == RESULTS.successful
     noise = jnp.where(checked, adjustment.sigma0, 0.0)
-    worst = jnp.max(jnp.diagonal(degeneracy.in_radians(solved, adjustment.cofactor)[0]))
-    margin = degeneracy.margin(pair, solved, adjustment.cofactor)
-    needed = degeneracy.required(freedom.astype(margin.dtype))
+    worst, worst_chosen = (
+        jnp.max(jnp.diagonal(degeneracy.in_radians(of, cofactor)[0]))
+        for of, cofactor in ((solved, adjustment.cofactor), (chosen, q))
+    )
+    direction = degeneracy.worst_direction(pair, solved, adjustment.cofactor)
+    free = freedom.astype(noise.dtype)
+    second, undivided = degeneracy.folded(direction, free, noise)
+    needed = degeneracy.required(free)
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
-        (begin.ambiguous, RESULTS.two_solutions),
+        (begin.ambiguous | second, RESULTS.two_solutions),
         (count(pair.mask & ~in_front & ~far & ~pair.coarse) > 0, RESULTS.points_behind_camera),
-        (~elements.exist(unit, length), RESULTS.elements_undefined),
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
-        ((noise**2 * worst > WEAK**2) | (margin < needed * noise), RESULTS.weakly_determined),
+        (~elements.exist(unit, length) | (noise**2 * worst_chosen > WEAK**2), RESULTS.elements_undefined),
+        ((noise**2 * worst > WEAK**2) | (direction.margin < needed * noise) | undivided, RESULTS.weakly_determined),
     ):
         result = RESULTS.where(fair & condition_holds, code, result)
     rotated = degeneracy.pure_rotation(inspected, pair.count - 5, noise) | begin.pure_rotation

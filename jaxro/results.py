@@ -50,9 +50,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "swap left and right, or give a negative base."
     )
     elements_undefined = (
-        "The chosen elements do not exist here: the base is at right angles to the x axis (or photo axis) they divide "
-        "by, or the given base is no length: 0, not finite, or negative for IndependentElements. Give another base, or "
-        "use RelativePose, which exists for every position."
+        "The chosen elements do not exist here, or have standard deviations above 0.04 rad (2°) where the pose has "
+        "not: the base is nearly at right angles to the x axis (or along the photo axis), or a photo turned by 90°; or "
+        "the given base is no length: 0, not finite, or negative for IndependentElements. Give another base, or use "
+        "RelativePose, which exists for every position."
     )
     diverged = (
         "The iterations did not converge. Look for gross errors in the coordinates, the focal lengths and the axes "

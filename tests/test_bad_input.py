@@ -38,8 +38,9 @@ def test_swapped_photos_show_in_the_sign_of_the_base():
     assert float(outcome(swapped).pose.bx) < -0.99
 
 
-def test_elements_that_do_not_exist():
-    forward = photographed(block(14, depth=(3.0, 6.0)) - [0.5, 0, 0], base=(0.0, 0.0, -1.0))
+@pytest.mark.parametrize("sigma", [0.0, 0.01])
+def test_elements_that_do_not_exist_or_are_nothing_but_errors(sigma):
+    forward = photographed(block(14, depth=(3.0, 6.0)) - [0.5, 0, 0], base=(0.0, 0.0, -1.0), sigma=sigma)
     assert name(outcome(forward)) == "successful"
     assert name(outcome(forward, elements=DependentElements, base=1.0)) == "elements_undefined"
     assert name(outcome(forward, elements=IndependentElements)) == "elements_undefined"

@@ -56,6 +56,10 @@ SHIFTS, TRIALS = 8, 4096
 """
 
 ACCIDENTS = 1e-4
+TURNS = 3
+ALIKE, CHANCE = 3.0, 0.05
+"""Wrong matches that agree on a base chosen for them, and the share of the others that agree by chance."""
+
 PLANE = 0.8
 """Share of the kept matches in a plane from which on that plane alone determines the pose."""
 
@@ -122,18 +126,22 @@ def judged(pair: Pair, pose: RelativePose) -> Found:
     pose, result = solved.pose, solved.result
     normal, _, share = plane(pair, pose, use, limit)
     kind = jnp.where(share < PLANE, int(Kind.oriented), int(Kind.plane))
+    weak = result == RESULTS.weakly_determined
     # what lies behind a photo here is infinitely far for its errors
-    fair = is_usable(result) | (result == RESULTS.points_behind_camera)
-    # a large sigma0 hides a base, too: the rays themselves have to be parallel, by the rotation alone
-    rotated, _ = rotation_only(*vectors(pair), use)
-    still = parallel(pair, rotated, limit)
-    turned = (result == RESULTS.zero_base) & (count(use & still) >= PLANE * count(use))
+    fair = is_usable(result) | weak | (result == RESULTS.points_behind_camera)
+    # a large sigma0 hides a base, too: the rays themselves have to be parallel, by the rotation alone. Without a base
+    # any will do, and then it is one that some wrong matches agree on: their parallaxes are no proof of it
+    turns = lambda _, still: parallel(pair, rotation_only(*vectors(pair), use & still)[0], limit)
+    still = lax.fori_loop(0, TURNS, turns, pair.mask)
+    rotated = rotation_only(*vectors(pair), use & still)[0]
+    few = count(use & ~still) <= ALIKE + CHANCE * count(pair.mask & ~still)
+    turned = ((result == RESULTS.zero_base) | few) & (count(use & still) >= PLANE * count(use))
     pose = jax.tree.map(lambda a, b: jnp.where(turned, a, b), rotated, pose)
     use = jnp.where(turned, still, use)
     believed = accidents(pair, pose, use, limit) < math.log(ACCIDENTS)
     for holds, other in (
         (~fair | ~believed, Kind.no_consensus),
-        (believed & (result == RESULTS.weakly_determined), Kind.weak),
+        (believed & weak & (share < PLANE), Kind.weak),
         (believed & turned, Kind.rotation),
         (count(pair.mask) < 6, Kind.too_few),
     ):

@@ -48,6 +48,7 @@ class Source:
 
     def __init__(self, path: Path, told: Path | None = None):
         self.path = told or path  # as it is told of: a CSV table has been converted
+        self._first = 1 if self.path == path else 2  # the row, or the line, of the first point
         try:
             self._file = pq.ParquetFile(path, pre_buffer=False)
         except (OSError, pa.ArrowInvalid) as error:
@@ -99,8 +100,8 @@ class Source:
         for batch in self._file.iter_batches(BATCH, columns=[self.columns[full]]):
             column = batch.column(0)
             if column.null_count:
-                row += int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0]) + 1
-                raise TableError(self.path, None, full, f"nothing in row {row}", f"the name of the {full}")
+                row += int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
+                raise TableError(self.path, None, full, f"nothing in {self._place(row)}", f"the name of the {full}")
             row += len(column)
 
     def _once(self, names: Any, begins: np.ndarray) -> None:
@@ -109,11 +110,14 @@ class Source:
         seen: set = set()
         for name, row in zip(names.to_pylist(), begins, strict=True):
             if name in seen:
-                found = f"pair {name!r} again in row {row + 1}, after other pairs"
+                found = f"pair {name!r} again in {self._place(int(row))}, after other pairs"
                 raise TableError(
                     self.path, None, "pair", found, "the rows of a pair one behind the other: sort the table"
                 )
             seen.add(name)
+
+    def _place(self, row: int) -> str:
+        return f"{'row' if self._first == 1 else 'line'} {row + self._first}"
 
     def rows(self, begin: int, end: int) -> Any:
         """These rows as an Arrow table with the full names of the columns; one behind the other is read only once."""
@@ -236,7 +240,7 @@ def converted(source: Path, target: Path) -> None:
     except (OSError, UnicodeDecodeError, csv.Error):
         header = []
     if header:
-        COLUMNS.places(header, str(source), None)
+        COLUMNS.places(header, str(source), 1)
     full = [COLUMNS.full(name) for name in header]
     text = ("pair", "point")
     draft = target.with_suffix(".partial")
@@ -244,7 +248,7 @@ def converted(source: Path, target: Path) -> None:
         types = {c: pa.string() if c in text else pa.float64() for c in full}
         reader = arrow_csv.open_csv(
             source,
-            parse_options=arrow_csv.ParseOptions(invalid_row_handler=_blank),
+            parse_options=arrow_csv.ParseOptions(invalid_row_handler=_blank) if header else None,
             read_options=arrow_csv.ReadOptions(column_names=full, skip_rows=1, block_size=1 << 24),
             convert_options=arrow_csv.ConvertOptions(column_types=types, null_values=[]),
         )

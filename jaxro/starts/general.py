@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from .. import rotations as rot
 from ..coplanarity import common_focal
-from ..degeneracy import significant
+from ..degeneracy import excess, significant
 from ..elements import RelativePose, vertical
 from ..inspection import inspect
 from ..normal_equations import steps
@@ -29,9 +29,6 @@ rounding would choose another one in another program."""
 
 BEHIND = 0.25
 """Share of points behind a photo above which a candidate counts as a wrong decomposition."""
-
-CERTAIN = 2.576
-"""Normal quantile, of one in 200, from which the better of two orientations is taken for the right one."""
 
 ENOUGH = 10
 """Points that are enough for a start."""
@@ -64,7 +61,7 @@ class General(AbstractStart):
         squares, other = (inspect(pair, pose).distance ** 2 for pose in (first, second))
         freedom = pair.count - 5
         ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
-        ambiguous = ambiguous & (other < squares * _excess(freedom) + EXACT)
+        ambiguous = ambiguous & (other < squares * excess(freedom) + EXACT)
         turn, parallax = rotation_only(left, right, pair.mask)
         noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
         noise = noise * pair.focal_left / common_focal(pair.focal_left, pair.focal_right)
@@ -91,15 +88,6 @@ def _accurate(pair: Pair) -> Pair:
     """The pair without its coarse points, of which a start has nothing to learn, if enough are left."""
     good = pair.mask & ~pair.coarse
     return cleaned(pair.with_mask(jnp.where(jnp.sum(good) >= ENOUGH, good, pair.mask)))[0]
-
-
-def _excess(freedom: Float[Array, ""]) -> Float[Array, ""]:
-    """The ratio of Σ r² of two orientations up to which they are not told apart.
-
-    Where both are right, as they are of points in a plane, it has Fisher's distribution with f = n - 5 degrees of
-    freedom each. Its quantile by his z: ln F is nearly normal with the variance 4 / (f - 1); for f = 1 as it is.
-    """
-    return jnp.where(freedom > 0, jnp.exp(2 * CERTAIN / jnp.sqrt(jnp.maximum(freedom - 1, 0.28))), 1.0)
 
 
 def vectors(pair: Pair) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
