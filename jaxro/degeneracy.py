@@ -90,7 +90,7 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     margin = jnp.where(drift > 0, jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0)), jnp.inf)
 
     _, pull = jax.vjp(fundamental, *(zero,) * 5)
-    columns = pull((tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])))  # Aᵀc
+    columns = stage(pull)((tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])))  # Aᵀc
     taken = sum(columns[i] * cofactor[i, j] * columns[j] for i in range(5) for j in range(5))
     back = jnp.abs(sum(e * h for e, h in zip(direction, columns, strict=True)))
     straight = back <= 0
