@@ -67,10 +67,10 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     direction = [e / length * unit for e, unit in zip(direction, units, strict=True)]
     zero = jnp.zeros_like(pair.focal_left)
 
-    def fundamental(*step):
-        return coplanarity.fundamental_matrix(*elements.moved(step).relative(), pair.focal_left, pair.focal_right)
+    def fundamental(rotation, base):
+        return coplanarity.fundamental_matrix(rotation, base, pair.focal_left, pair.focal_right)
 
-    along = lambda t: fundamental(*(t * e for e in direction))
+    along = lambda t: fundamental(*elements.moved(tuple(t * e for e in direction)).relative())
     slope_at = lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),))
     (f, slope), (_, curve) = jax.jvp(slope_at, (zero,), (jnp.ones_like(zero),))
 
@@ -89,8 +89,10 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     ratio = change / jnp.where(drift > 0, drift, 1.0)
     margin = jnp.where(drift > 0, jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0)), jnp.inf)
 
-    _, pull = jax.vjp(fundamental, *(zero,) * 5)
-    columns = stage(pull)((tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])))  # Aᵀc
+    by_entry = tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])
+    _, slopes = elements.slopes(fundamental, (zero,) * 5)
+    dot = lambda m: sum(rot.dot(*rows) for rows in zip(m, by_entry, strict=True))
+    columns = stage(lambda slopes: [dot(m) for m in slopes])(slopes)  # Aᵀc
     taken = sum(columns[i] * cofactor[i, j] * columns[j] for i in range(5) for j in range(5))
     back = jnp.abs(sum(e * h for e, h in zip(direction, columns, strict=True)))
     straight = back <= 0
