@@ -56,10 +56,11 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     has eᵀ N e = Σ (g'/ (sigma |∇g|))², and each coordinate moves g' by ∇g', so that errors of size m alone produce
     m² Σ (|∇g'| / |∇g|)²: the two are equal at m = margin.
 
-    To second order the residuals are r + a t + c t²/2 with a = A e at right angles to all other columns of A. The part
-    of c along a, c.a/a.a, brings them back at t = -2 a.a / c.a; what of c no column takes up, c.c - cᵀA Q Aᵀc, is left
-    as Σ r² + t⁴/4 of it. Layouts near a critical surface, such as a valley along the base on the cylinder through both
-    stations, have there another minimum that the linearised statistics of the first know nothing of.
+    To second order the residuals are r + a t + c t²/2 with a = A e at right angles to all other columns of A and
+    c = (g'' - 2 g' ∇g.∇g' / |∇g|²) / (sigma |∇g|), but for terms of g itself. The part of c along a, c.a/a.a, brings
+    them back at t = -2 a.a / c.a; what of c no column takes up, c.c - cᵀA Q Aᵀc, is left as Σ r² + t⁴/4 of it. Layouts
+    near a critical surface, such as a valley along the base on the cylinder through both stations, have there another
+    minimum that the linearised statistics of the first know nothing of.
     """
     scaled, units = in_radians(elements, cofactor)
     direction = stage(_worst)(scaled)
@@ -79,11 +80,9 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
         g, moved, turned = coplanarity.linearised(slope, point, use)
         weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
         bent = coplanarity.condition(curve, point) - 2 * g * sum(x * y for x, y in zip(b, turned, strict=True)) / square
-        # g is linear in F, so that its derivatives by F are products of coordinates
-        x1, y1, x2, y2 = point
-        entries = (x1 * x2, x1 * y2, x1, y1 * x2, y1 * y2, y1, x2, y2, 1.0)
+        by_f = sum(jax.grad(coplanarity.condition)(f, point), ())
         terms = g**2 * weight, moved * sigma**2 * weight, bent**2 * weight
-        return *terms, *(bent * weight * entry for entry in entries)
+        return *terms, *(bent * weight * entry for entry in by_f)
 
     change, drift, bends, *products = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
     ratio = change / jnp.where(drift > 0, drift, 1.0)

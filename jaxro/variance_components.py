@@ -43,6 +43,7 @@ class Components(eqx.Module):
     one group. `covariance`: of the variances sigma²; rows of what is not estimable are 0. A sigma of 0 that is
     estimable came out negative: the errors of this group are too small to be seen beside the others, and
     `variance_error` says how small.
+    Where it has not `converged`, none of this is to be used.
     `redundancy`: the part of each group in the degrees of freedom.
     """
 

@@ -57,6 +57,8 @@ SHIFTS, TRIALS = 8, 4096
 
 ACCIDENTS = 1e-4
 TURNS = 3
+"""Of the rotation without a base, each by the matches that the last one takes along."""
+
 ALIKE, CHANCE = 3.0, 0.05
 """Wrong matches that agree on a base chosen for them, and the share of the others that agree by chance."""
 
