@@ -8,11 +8,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from . import coplanarity, rotations as rot
 from .elements import AbstractElements
 from .inspection import Inspection
+from .normal_equations import quadratic
 from .pairs import Pair
 from .programs import stage
 from .reductions import sums
@@ -63,7 +65,7 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     minimum that the linearised statistics of the first know nothing of.
     """
     scaled, units = in_radians(elements, cofactor)
-    direction = stage(_worst)(scaled)
+    direction = _worst(scaled)
     length = jnp.sqrt(sum((e * e for e in direction), jnp.zeros(())))
     direction = [e / length * unit for e, unit in zip(direction, units, strict=True)]
     zero = jnp.zeros_like(pair.focal_left)
@@ -71,9 +73,13 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     def fundamental(rotation, base):
         return coplanarity.fundamental_matrix(rotation, base, pair.focal_left, pair.focal_right)
 
-    along = lambda t: fundamental(*elements.moved(tuple(t * e for e in direction)).relative())
-    slope_at = lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),))
-    (f, slope), (_, curve) = jax.jvp(slope_at, (zero,), (jnp.ones_like(zero),))
+    along = lambda t: elements.moved(tuple(t * e for e in direction)).relative()
+    (rotation, base), (turning, moving) = jax.jvp(along, (zero,), (jnp.ones_like(zero),))
+    # F is linear in R and in b; of a steady turn R'' = R' Rᵀ R', of a steady shift b'' = 0
+    f = fundamental(rotation, base)
+    slope = _plus(fundamental(turning, base), fundamental(rotation, moving))
+    bending = rot.product(turning, rot.product(rot.transpose(rotation), turning))
+    curve = _plus(fundamental(bending, base), fundamental(turning, tuple(2 * entry for entry in moving)))
 
     def one(point, sigma, use):
         _, square, b = coplanarity.linearised(f, point, use)
@@ -89,10 +95,9 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     margin = jnp.where(drift > 0, jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0)), jnp.inf)
 
     by_entry = tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])
-    _, slopes = elements.slopes(fundamental, (zero,) * 5)
-    dot = lambda m: sum(rot.dot(*rows) for rows in zip(m, by_entry, strict=True))
-    columns = stage(lambda slopes: [dot(m) for m in slopes])(slopes)  # Aᵀc
-    taken = sum(columns[i] * cofactor[i, j] * columns[j] for i in range(5) for j in range(5))
+    dot = lambda *x: sum(map(rot.dot, fundamental(*elements.moved(x).relative()), by_entry))
+    columns = stage(jax.grad(dot, argnums=(0, 1, 2, 3, 4)))(*(zero,) * 5)  # Aᵀc
+    taken = quadratic([list(row) for row in cofactor], columns)
     back = jnp.abs(sum(e * h for e, h in zip(direction, columns, strict=True)))
     straight = back <= 0
     t = jnp.where(straight, jnp.inf, 2 * change / jnp.where(straight, 1.0, back))
@@ -100,20 +105,20 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     return WorstDirection(margin, t * jnp.sqrt(jnp.maximum(change, 0.0)), t, rise)
 
 
+def _plus(a: rot.Matrix, b: rot.Matrix) -> rot.Matrix:
+    return tuple(tuple(x + y for x, y in zip(*rows, strict=True)) for rows in zip(a, b, strict=True))  # pyright: ignore
+
+
 def _worst(cofactor: Float[Array, "p p"]) -> list:
     """The eigenvector of the largest eigenvalue of a cofactor matrix, of any length: powers on a column."""
-    n = range(len(cofactor))
-    q = [[cofactor[i, k] for k in n] for i in n]
-    trace = sum(q[i][i] for i in n)
-    q = [[entry / trace for entry in row] for row in q]
+    q = [list(row) for row in cofactor / jnp.trace(cofactor)]
     column, most = q[0], q[0][0]
-    for k in n[1:]:
-        longer = q[k][k] > most
-        column = [jnp.where(longer, a, b) for a, b in zip(q[k], column, strict=True)]
-        most = jnp.where(longer, q[k][k], most)
-    for _ in range(POWERS):
-        column = [sum(q[i][k] * column[k] for k in n) for i in n]
-    return column
+    for k, row in enumerate(q[1:], 1):
+        longer = row[k] > most
+        column = [jnp.where(longer, a, b) for a, b in zip(row, column, strict=True)]
+        most = jnp.where(longer, row[k], most)
+    multiplied = lambda column: [sum(a * b for a, b in zip(row, column, strict=True)) for row in q]
+    return lax.fori_loop(0, POWERS, lambda _, column: multiplied(column), column)
 
 
 def required(freedom: Float[Array, ""]) -> Float[Array, ""]:

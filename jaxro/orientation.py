@@ -19,7 +19,7 @@ from .losses import AbstractLoss
 from .model_points import model_points
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned, double
-from .programs import FAST, QUICK, Program, loops, traced
+from .programs import FAST, QUICK, QUICKEST, Program, loops, traced
 from .reductions import count, total
 from .results import RESULTS, is_usable
 
@@ -122,7 +122,8 @@ def orient(
     if traced((pair, base, start)):
         return _orient(pair, start=start, **options)
     kernel = loops if solver is None and pair.x_left.size else None  # the compiler does not survive one of no points
-    run = lambda function, start: Program(function, options | {"start": start}, QUICK, kernel=kernel)(pair)
+    settings = QUICKEST if pair.x_left.size <= FEW else QUICK
+    run = lambda function, start: Program(function, options | {"start": start}, settings, kernel=kernel)(pair)
     if not isinstance(start, starts.Auto):
         return run(_orient, start)
     # two small programs instead of one large: the general start is compiled when a pair first needs it
@@ -134,6 +135,9 @@ DEFAULTS = {
     name: option.default for name, option in signature(orient).parameters.items() if option.kind is option.KEYWORD_ONLY
 }
 """What `orient` takes for the options it is not given."""
+
+FEW = 32
+"""Points up to which the fastest way to compile outweighs slower code."""
 
 NEAR_STEPS = 10
 """Steps allowed from the vertical without a loss: near-vertical photos take four or five."""

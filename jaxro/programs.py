@@ -4,7 +4,9 @@ A program is cached by its function and its static options (classes, modules, pl
 the same options compiles nothing.
 """
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -31,6 +33,10 @@ WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 QUICK = {**FAST, "xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 """For single pairs: the older code generator at a lower level compiles in half the time, and runs no slower there."""
+
+QUICKEST = {**QUICK, "xla_backend_optimization_level": 0}
+"""For what is done once: compiles in another fifth less of the time, and a single pair of few points takes a tenth
+longer."""
 
 ONE_KERNEL = {"xla_cpu_experimental_ynn_fusion_type": ""}
 """No sums by a library, which a kernel cannot call."""
@@ -108,7 +114,23 @@ class Program:
 
 
 def _flat(function: Callable, static: _Key) -> Callable:
-    return lambda data, arrays: function(data, **eqx.combine(arrays, static.tree))
+    def flat(data: PyTree, arrays: dict[str, Any]) -> PyTree:
+        with _uncollected():
+            return function(data, **eqx.combine(arrays, static.tree))
+
+    return flat
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without the garbage collector, which looks again and again through a trace of which nothing is garbage yet."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def _settings(settings: tuple) -> dict[str, Any] | None:
