@@ -6,6 +6,7 @@ that a batch of pairs is arithmetic on flat arrays. Points that do not exist are
 """
 
 from collections.abc import Sequence
+from types import ModuleType
 
 import equinox as eqx
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
+from .programs import traced
 from .reductions import count, total
 
 Coordinates = tuple[Float[Array, "*pairs point"], ...]
@@ -110,7 +112,9 @@ def pair(
     Raises ValueError where the shapes do not agree.
     """
     dtype = jnp.result_type(float)
-    coordinates = [jnp.asarray(c, dtype) for c in (x_left, y_left, x_right, y_right)]
+    left, right = focal if isinstance(focal, tuple | list) else (focal, focal)
+    xp = _library((x_left, y_left, x_right, y_right, left, right, sigma, weight, mask))
+    coordinates = [xp.array(c, dtype) for c in (x_left, y_left, x_right, y_right)]
     shape = coordinates[0].shape
     if len(shape) == 0:
         raise ValueError("pair: coordinates must be arrays with the points on the last axis, got single numbers")
@@ -118,17 +122,26 @@ def pair(
         if c.shape != shape:
             raise ValueError(f"pair: {name} has shape {c.shape}, x_left has {shape}; all four must agree")
     try:
-        taking_part = jnp.broadcast_to(jnp.asarray(True if mask is None else mask, bool), shape)
-        deviation = jnp.broadcast_to(jnp.asarray(1.0 if sigma is None else sigma, dtype), shape)
+        taking_part = xp.broadcast_to(xp.array(True if mask is None else mask, bool), shape)
+        deviation = xp.broadcast_to(xp.array(1.0 if sigma is None else sigma, dtype), shape)
         if weight is not None:
-            relative = jnp.broadcast_to(jnp.asarray(weight, dtype), shape)
+            relative = xp.broadcast_to(xp.array(weight, dtype), shape)
             taking_part = taking_part & (relative != 0)
-            deviation = deviation / jnp.sqrt(jnp.where(relative == 0, 1.0, relative))
+            deviation = deviation / xp.sqrt(xp.where(relative == 0, 1.0, relative))
     except ValueError as error:
         raise ValueError(f"pair: mask, sigma and weight must fit the coordinates' shape {shape}: {error}") from None
-    left, right = focal if isinstance(focal, tuple | list) else (focal, focal)
-    focals = [jnp.broadcast_to(jnp.asarray(f, dtype), shape[:-1]) for f in (left, right)]
-    return Pair(*coordinates, deviation, taking_part, *focals)
+    focals = [xp.broadcast_to(xp.array(f, dtype), shape[:-1]) for f in (left, right)]
+    return _filled([*coordinates, deviation, taking_part, *focals])
+
+
+def _library(values: PyTree) -> ModuleType:
+    """NumPy, which compiles nothing for each new length; of what is being traced, JAX's."""
+    return jnp if traced(values) else np
+
+
+def _filled(fields: list) -> Pair:
+    """A `Pair` of these arrays, which nobody else changes: their memory is not copied."""
+    return Pair(*(fields if traced(fields) else jax.device_put(fields)))
 
 
 def double(one: PyTree) -> PyTree:
@@ -149,28 +162,32 @@ def pad(one: Pair, points: int) -> Pair:
     missing = points - one.x_left.shape[-1]
     if missing < 0:
         raise ValueError(f"pad: the pair has {one.x_left.shape[-1]} points, more than {points}")
-    widths = [(0, 0)] * (one.x_left.ndim - 1) + [(0, missing)]
-    coordinates = [jnp.pad(c, widths) for c in one.coordinates]
-    return Pair(
-        *coordinates,
-        jnp.pad(one.sigma, widths, constant_values=1.0),
-        jnp.pad(one.mask, widths),
-        one.focal_left,
-        one.focal_right,
-    )
+    return _filled(_padded(one, missing, _library(one)))
 
 
-def stack(pairs: Sequence[Pair]) -> Pair:
-    """One batch of many single pairs, padded to the longest."""
+def _padded(one: Pair, missing: int, xp: ModuleType) -> list:
+    """The fields of a `Pair` with as many places more."""
+    shape = *one.x_left.shape[:-1], missing
+    places = lambda field, fill=0: xp.concatenate([field, xp.full(shape, fill, field.dtype)], axis=-1)
+    return [*map(places, one.coordinates), places(one.sigma, 1), places(one.mask), one.focal_left, one.focal_right]
+
+
+def stack(pairs: Sequence[Pair], points: int | None = None) -> Pair:
+    """One batch of many single pairs, padded to the longest or to `points`."""
     if not pairs:
         raise ValueError("stack: no pairs given")
-    longest = max(one.x_left.shape[-1] for one in pairs)
-    return jax.tree.map(lambda *fields: jnp.stack(fields), *[pad(one, longest) for one in pairs])
+    longest = max(one.x_left.shape[-1] for one in pairs) if points is None else points
+    xp = _library(pairs)
+    rows = [_padded(one, longest - one.x_left.shape[-1], xp) for one in pairs]
+    return _filled([xp.stack(fields) for fields in zip(*rows, strict=True)])
 
 
 def unstack(batch: Pair) -> list[Pair]:
     """The single pairs of a batch, padding left in place."""
-    return [jax.tree.map(lambda field, i=i: field[i], batch) for i in range(batch.x_left.shape[0])]
+    if not traced(batch):
+        batch = jax.tree.map(np.asarray, batch)
+    fields = jax.tree.leaves(batch)
+    return [_filled([field[i] for field in fields]) for i in range(batch.x_left.shape[0])]
 
 
 def swapped(one: Pair) -> Pair:

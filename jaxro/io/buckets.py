@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..padding import sizes
-from ..pairs import Pair
+from ..pairs import Pair, stack
 
 
 def each(
@@ -32,7 +32,7 @@ def each(
         step = min(len(members), most(size))
         for begin in range(0, len(members), step):
             part = members[begin : begin + step]
-            batch = _batch([pairs[i] for i in part], size)
+            batch = jax.tree.map(np.asarray, stack([pairs[i] for i in part], size))
             told = lambda done, total, before=finished: progress(min(before + done, len(pairs)))
             found = jax.tree.map(np.asarray, many(_filled(batch, step), told))
             finished += len(part)
@@ -47,12 +47,6 @@ def buckets(lengths: list[int]) -> dict[int, list[int]]:
     place = np.searchsorted(chosen, known)
     every = {size: np.flatnonzero(place == k).tolist() for k, size in enumerate(chosen)}
     return {size: members for size, members in every.items() if members}
-
-
-def _batch(pairs: list[Pair], size: int) -> Pair:
-    """`jaxro.stack` padded to `size`, in NumPy: thousands of lengths, nothing to compile."""
-    fitted = lambda field: np.pad(field, (0, size - len(field))) if field.ndim else field
-    return jax.tree.map(lambda *fields: np.stack([fitted(field) for field in fields]), *pairs)
 
 
 def _filled(batch: Pair, count: int) -> Pair:
