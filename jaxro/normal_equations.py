@@ -182,7 +182,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
         size = longest / (self.atol + self.rtol * largest)
         previous = state[1]
         ratio = jnp.where(previous > 0, jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)), 1.0)
-        predicted = size * jnp.where(ratio > 0.5, ratio * min(1.0, self.atol / ROUNDING), ratio)
+        slow = (previous > 0) & (ratio > 0.5)  # a first step tells nothing of how they fall
+        predicted = size * jnp.where(slow, ratio * min(1.0, self.atol / ROUNDING), ratio)
         return jax.tree.unflatten(structure, moved), (predicted, size), None
 
     def terminate(self, fn, y, args, options, state, tags):

@@ -26,8 +26,9 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 import jax  # noqa: E402
 
-import jaxro  # noqa: E402, F401  (64 bit)
+from jaxro import programs  # noqa: E402  (64 bit)
 
+programs.QUICK.update(programs.QUICKEST)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
