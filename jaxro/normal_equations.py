@@ -33,7 +33,7 @@ SINGULAR = 1e-12
 """Relative pivot below which a parameter counts as undetermined by those before it."""
 
 ROUNDING = 1e-10
-"""Relative size of steps that have no use any more where they do not fall by half."""
+"""Relative size of steps that have no use any more where they do not fall."""
 
 
 def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None):
@@ -145,8 +145,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
 
     `args` that know their own residuals and columns, and how a step follows others (`adjustment.Residuals`), are asked
     for them; any other residual function is linearised. Ends when the *next* step, predicted from the last two, is
-    below atol + rtol |x|, or below ROUNDING in their place if steps no longer fall by half: they are rounding errors
-    then, or converge slowly. `max_step` bounds the largest component of a step (0.5 rad for orientations, where a
+    below atol + rtol |x|, or below ROUNDING in their place if steps no longer fall: they are rounding errors then.
+    `max_step` bounds the largest component of a step (0.5 rad for orientations, where a
     longer one leaves the range of the linearisation).
     """
 
@@ -182,8 +182,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
         size = longest / (self.atol + self.rtol * largest)
         previous = state[1]
         ratio = jnp.where(previous > 0, jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)), 1.0)
-        slow = (previous > 0) & (ratio > 0.5)  # a first step tells nothing of how they fall
-        predicted = size * jnp.where(slow, ratio * min(1.0, self.atol / ROUNDING), ratio)
+        rounding = (previous > 0) & (ratio >= 1)  # a first step tells nothing of how they fall
+        predicted = size * jnp.where(rounding, min(1.0, self.atol / ROUNDING), ratio)
         return jax.tree.unflatten(structure, moved), (predicted, size), None
 
     def terminate(self, fn, y, args, options, state, tags):

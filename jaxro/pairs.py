@@ -89,9 +89,12 @@ class Pair(eqx.Module):
         mean = total(weight) / jnp.maximum(self.count, 1.0)
         return self.mask & (weight * COARSE**2 < mean[..., None])
 
-    def with_mask(self, mask: Bool[Array, "*pairs point"]) -> "Pair":
-        """The same pair with other points taking part."""
-        return eqx.tree_at(lambda pair: pair.mask, self, mask)
+    def with_mask(self, mask: Values) -> "Pair":
+        """The same pair with other points taking part. Raises ValueError where the shapes do not agree."""
+        new = mask if traced(mask) else jax.device_put(np.array(mask, bool))
+        if np.shape(new) != np.shape(self.mask):
+            raise ValueError(f"with_mask: the mask has shape {np.shape(new)}, the pair {np.shape(self.mask)}")
+        return eqx.tree_at(lambda pair: pair.mask, self, new)
 
 
 def pair(
@@ -109,12 +112,22 @@ def pair(
 
     `focal`: one focal length, or (left, right). `sigma`: standard deviation of a coordinate, per point or for all
     (default 1). `weight`: relative weights, sigma / sqrt(weight); weight 0 leaves the point out.
-    Raises ValueError where the shapes do not agree.
+    Raises ValueError where the shapes do not agree, and for what are no real numbers.
     """
     dtype = jnp.result_type(float)
+    if isinstance(focal, tuple | list) and len(focal) != 2:
+        raise ValueError(f"pair: focal must be one focal length, or (left, right), got {len(focal)} of them")
     left, right = focal if isinstance(focal, tuple | list) else (focal, focal)
-    xp = _library((x_left, y_left, x_right, y_right, left, right, sigma, weight, mask))
-    coordinates = [xp.array(c, dtype) for c in (x_left, y_left, x_right, y_right)]
+    given = x_left, y_left, x_right, y_right, left, right, sigma, weight, mask
+    names = "x_left", "y_left", "x_right", "y_right", "focal", "focal", "sigma", "weight", "mask"
+    for name, values in zip(names, given, strict=True):
+        if isinstance(values, np.ma.MaskedArray):
+            raise ValueError(f"pair: {name} is a masked array of NumPy: give values, and what takes part as mask=")
+        needed = name not in ("sigma", "weight", "mask")
+        if (needed and values is None) or (values is not None and np.iscomplexobj(values)):
+            raise ValueError(f"pair: {name} must be real numbers, got {type(values).__name__}")
+    xp = _library(given)
+    coordinates = [xp.array(c, dtype) for c in given[:4]]
     shape = coordinates[0].shape
     if len(shape) == 0:
         raise ValueError("pair: coordinates must be arrays with the points on the last axis, got single numbers")
@@ -126,11 +139,14 @@ def pair(
         deviation = xp.broadcast_to(xp.array(1.0 if sigma is None else sigma, dtype), shape)
         if weight is not None:
             relative = xp.broadcast_to(xp.array(weight, dtype), shape)
+            if xp is np and np.any(relative < 0):
+                raise ValueError("a weight is negative")
             taking_part = taking_part & (relative != 0)
             deviation = deviation / xp.sqrt(xp.where(relative == 0, 1.0, relative))
+        focals = [xp.broadcast_to(xp.array(f, dtype), shape[:-1]) for f in (left, right)]
     except ValueError as error:
-        raise ValueError(f"pair: mask, sigma and weight must fit the coordinates' shape {shape}: {error}") from None
-    focals = [xp.broadcast_to(xp.array(f, dtype), shape[:-1]) for f in (left, right)]
+        fit = f"mask, sigma and weight must fit the coordinates' shape {shape}, focal lengths {shape[:-1]}"
+        raise ValueError(f"pair: {fit}: {error}") from None
     return _filled([*coordinates, deviation, taking_part, *focals])
 
 
@@ -159,33 +175,40 @@ def double(one: PyTree) -> PyTree:
 
 def pad(one: Pair, points: int) -> Pair:
     """The pair with zeros up to `points` places, masked out. Raises ValueError if it has more."""
+    return _filled(_padded(one, points, _library(one)))
+
+
+def _padded(one: Pair, points: int, xp: ModuleType) -> list:
+    """New fields of a `Pair`, with so many places."""
     missing = points - one.x_left.shape[-1]
     if missing < 0:
         raise ValueError(f"pad: the pair has {one.x_left.shape[-1]} points, more than {points}")
-    return _filled(_padded(one, missing, _library(one)))
-
-
-def _padded(one: Pair, missing: int, xp: ModuleType) -> list:
-    """The fields of a `Pair` with as many places more."""
     shape = *one.x_left.shape[:-1], missing
     places = lambda field, fill=0: xp.concatenate([field, xp.full(shape, fill, field.dtype)], axis=-1)
-    return [*map(places, one.coordinates), places(one.sigma, 1), places(one.mask), one.focal_left, one.focal_right]
+    focals = map(xp.array, (one.focal_left, one.focal_right))
+    return [*map(places, one.coordinates), places(one.sigma, 1), places(one.mask), *focals]
 
 
 def stack(pairs: Sequence[Pair], points: int | None = None) -> Pair:
-    """One batch of many single pairs, padded to the longest or to `points`."""
+    """One batch of many single pairs, padded to the longest or to `points`. Raises ValueError for what is no list of
+    single pairs, and for more points."""
+    pairs = list(pairs)
     if not pairs:
         raise ValueError("stack: no pairs given")
+    if any(one.x_left.ndim != 1 for one in pairs):
+        raise ValueError("stack: single pairs are wanted, got a batch (pair, point): take it apart with unstack")
     longest = max(one.x_left.shape[-1] for one in pairs) if points is None else points
     xp = _library(pairs)
-    rows = [_padded(one, longest - one.x_left.shape[-1], xp) for one in pairs]
+    rows = [_padded(one, longest, xp) for one in pairs]
     return _filled([xp.stack(fields) for fields in zip(*rows, strict=True)])
 
 
 def unstack(batch: Pair) -> list[Pair]:
-    """The single pairs of a batch, padding left in place."""
+    """The single pairs of a batch, padding left in place. Raises ValueError for a single pair."""
+    if batch.x_left.ndim < 2:
+        raise ValueError("unstack: a batch of pairs (pair, point) is wanted, got one pair")
     if not traced(batch):
-        batch = jax.tree.map(np.asarray, batch)
+        batch = jax.tree.map(np.array, batch)  # what is made of it keeps its memory
     fields = jax.tree.leaves(batch)
     return [_filled([field[i] for field in fields]) for i in range(batch.x_left.shape[0])]
 

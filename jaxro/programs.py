@@ -193,7 +193,7 @@ def loops(function: Callable) -> Callable:
 
 def part(function: Callable) -> Callable:
     """Where kernels are made a kernel of its own, which the compiler makes better than a piece of a large one."""
-    return _call(function, **_AS_ONE) if _kernels.value else function
+    return _call(function, **_AS_ONE) if _kernels.value else eqx.filter_jit(function)
 
 
 _AS_ONE = {"inlineable": "false", "xla_cpu_small_call": "true"}

@@ -104,6 +104,8 @@ def batch(block: Block, points: PhotoPoints, size: int, sigma: float) -> Fields:
     A match with a keypoint that no ray is seen at is masked. The sigma of a match is that of the keypoints times the
     root mean square of their scales.
     """
+    if not len(points.x):  # places without a match need one to point to
+        points = PhotoPoints(*(np.zeros(1, a.dtype) for a in points))
     n, j = block.lengths[:, None], np.arange(size)[None, :]
     begin = np.cumsum(block.lengths)[:, None] - n
     there = j < n

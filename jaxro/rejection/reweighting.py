@@ -44,8 +44,8 @@ class Reweighting(AbstractSearch):
         pair = scaled(cleaned(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         rests, pose, share = self._solved(fixed)
-        use = pair.mask & (normalised(linearised(fixed, pose), share) <= self.limit)
-        return judged(pair, pose, use, self.limit).only_if(rests, OUTCOMES.did_not_rest)
+        w = normalised(linearised(fixed, pose), share)
+        return judged(pair, pose, pair.mask & (w <= self.limit), self.limit, w).only_if(rests, OUTCOMES.did_not_rest)
 
     def search(self, pair: Pair) -> RelativePose:
         return self._solved(pair)[1]

@@ -31,10 +31,13 @@ class AbstractSearch(AbstractProcedure):
         """A pose near the right one, in spite of the wrong points."""
 
 
-def judged(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike) -> Rejection:
-    """The verdict that only `use` are right, with the evidence |w| against the limit and the orientation of them."""
+def judged(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, w: Values | None = None) -> Rejection:
+    """The verdict that only `use` are right, with the orientation of them and the evidence |w| against the limit: that
+    by which it was decided, or else that of this orientation."""
     solved = orient(pair.with_mask(use), start=pose)
-    w = jnp.where(pair.mask, normalised(linearised(pair, solved.pose), use), 0.0)
+    if w is None:
+        w = normalised(linearised(pair, solved.pose), use)
+    w = jnp.where(pair.mask, w, 0.0)
     limit = jnp.asarray(limit, w.dtype)
     new = Round(w, limit, pair.mask & ~use, solved.parallax, independent(solved.pose))
     return ended(recorded(began(pair, 1), new), solved, finished(pair))
