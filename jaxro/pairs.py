@@ -123,9 +123,8 @@ def pair(
     for name, values in zip(names, given, strict=True):
         if isinstance(values, np.ma.MaskedArray):
             raise ValueError(f"pair: {name} is a masked array of NumPy: give values, and what takes part as mask=")
-        needed = name not in ("sigma", "weight", "mask")
-        if (needed and values is None) or (values is not None and np.iscomplexobj(values)):
-            raise ValueError(f"pair: {name} must be real numbers, got {type(values).__name__}")
+        if values is not None and np.iscomplexobj(values):
+            raise ValueError(f"pair: {name} must be real numbers, not complex ones")
     xp = _library(given)
     coordinates = [xp.array(c, dtype) for c in given[:4]]
     shape = coordinates[0].shape
@@ -185,8 +184,8 @@ def _padded(one: Pair, points: int, xp: ModuleType) -> list:
         raise ValueError(f"pad: the pair has {one.x_left.shape[-1]} points, more than {points}")
     shape = *one.x_left.shape[:-1], missing
     places = lambda field, fill=0: xp.concatenate([field, xp.full(shape, fill, field.dtype)], axis=-1)
-    focals = map(xp.array, (one.focal_left, one.focal_right))
-    return [*map(places, one.coordinates), places(one.sigma, 1), places(one.mask), *focals]
+    *coordinates, sigma, mask, left, right = jax.tree.leaves(one)
+    return [*map(places, coordinates), places(sigma, 1), places(mask), xp.array(left), xp.array(right)]
 
 
 def stack(pairs: Sequence[Pair], points: int | None = None) -> Pair:

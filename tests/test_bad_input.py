@@ -98,6 +98,38 @@ def test_wrong_arguments_raise_before_anything_is_traced():
         jaxro.orient(jaxro.stack([photographed(block())]))
     with pytest.raises(ValueError, match="batch of pairs"):
         jaxro.orient_batch(photographed(block()))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda x: jaxro.pair(np.ma.array(x, mask=x > 1), x, x, x, focal=1.0), "x_left is a masked array"),
+        (lambda x: jaxro.pair(x, x, x + 1j, x, focal=1.0), "x_right must be real"),
+        (lambda x: jaxro.pair(x, x, x, x, focal=(1.0, 2.0, 3.0)), r"\(left, right\), got 3"),
+        (lambda x: jaxro.pair(x, x, x, x, focal=x), "focal lengths"),
+        (lambda x: jaxro.pair(x, x, x, x, focal=1.0, weight=x - 1), "negative"),
+        (lambda x: jaxro.pair(x, x, x, x, focal=1.0).with_mask([True] * 3), r"shape \(3,\), the pair \(4,\)"),
+        (lambda x: jaxro.stack([jaxro.pair(x, x, x, x, focal=1.0)], points=3), "4 points, more than 3"),
+        (lambda x: jaxro.stack([jaxro.stack([jaxro.pair(x, x, x, x, focal=1.0)])]), "single pairs are wanted"),
+        (lambda x: jaxro.unstack(jaxro.pair(x, x, x, x, focal=1.0)), "got one pair"),
+    ],
+)
+def test_what_makes_no_pair_is_told(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(np.arange(4.0))
+
+
+@pytest.mark.parametrize("points", [8, 64])  # some sizes begin where an array can be used without copying it
+def test_a_pair_keeps_its_numbers_whatever_becomes_of_the_arrays_it_was_made_of(points):
+    given = [np.arange(points) + float(k) for k in range(1, 8)] + [np.ones(points, bool)]
+    made = jaxro.pair(*given[:4], focal=(100.0, 101.0), sigma=given[4], weight=given[5], mask=given[7])
+    numpy = jax.tree.map(np.array, made)
+    pairs = [made, made.with_mask(given[7]), jaxro.pad(numpy, points), jaxro.stack([numpy, made])]
+    pairs += jaxro.unstack(jax.tree.map(lambda a: np.stack([a, a]), numpy))
+    before = jax.tree.map(np.array, pairs)
+    for array in (*given, *jax.tree.leaves(numpy)):
+        array[...] = 0
+    jax.tree.map(np.testing.assert_array_equal, pairs, before)
     with pytest.raises(ValueError, match="focal must be a positive"):
         jaxro.Camera(focal=-1.0)
 

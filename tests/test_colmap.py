@@ -270,6 +270,30 @@ PARAMETERS = {
 }
 
 
+def test_matches_that_repeat_others_are_no_evidence(tmp_path):
+    """Five matches prove nothing however often they stand there; of a sound pair repeats are kept with what they
+    repeat. A geometry of a pair without matches is left, and told; images without keypoints harm nobody."""
+    rng, path = np.random.default_rng(4), tmp_path / "repeats.db"
+    cloud = rng.uniform([-2, -2, 4], [2, 2, 9], (60, 3))
+    with pycolmap.Database.open(str(path)) as database:
+        camera = pycolmap.Camera(
+            model="SIMPLE_PINHOLE", width=2000, height=1600, params=[1000, 1000, 800], has_prior_focal_length=True
+        )
+        cameras = (database.write_camera(camera),) * 2
+        add = lambda points: add_pair(database, cameras, rng, points, np.eye(3), np.array([0.8, 0.3, 0.1]))
+        five, sound, _ = add(np.tile(cloud[:5], (12, 1))), add(cloud), add(cloud[:0])
+        rows = np.concatenate([np.arange(60), np.arange(20)])[:, None].repeat(2, axis=1).astype(np.uint32)
+        for pair, matches in ((five, np.tile(rows[:5], (12, 1))), (sound, rows)):
+            database.delete_matches(*pair)
+            database.write_matches(*pair, matches)
+        database.write_two_view_geometry(five[0], sound[1], pycolmap.TwoViewGeometry())
+    result = run(path, "--sigma", NOISE, "--force")
+    assert "1 geometries of pairs without a row in matches" in result.stdout
+    with pycolmap.Database.open(str(path)) as database:
+        assert len(database.read_two_view_geometry(*five).inlier_matches) == 0
+        assert len(database.read_two_view_geometry(*sound).inlier_matches) == 80
+
+
 def camera_of(model, parameters):
     names = next(names for name, names in MODELS.values() if name == model)
     theirs = pycolmap.Camera(model=model, width=1024, height=768, params=parameters)

@@ -7,7 +7,7 @@ import oracles
 import pytest
 
 import jaxro
-from jaxro import DependentElements, losses, simulation
+from jaxro import DependentElements, losses, simulation, starts
 
 FOCAL, BASE = 150.0, 90.0
 TRUE = np.array([1.2, -0.8, 0.02, -0.01, 0.03])
@@ -73,6 +73,20 @@ def test_orientation_is_the_minimum_of_the_written_out_objective(loss):
         assert np.all(np.abs(x - TRUE) < 4 * np.array(found.deviations))
         away = lambda elements: np.sum(((np.array(elements) - TRUE) / np.array(found.deviations)) ** 2)
         assert away(x) < 0.1 * away(squares)
+
+
+@pytest.mark.parametrize("loss", [losses.Cauchy(scale=0.02), losses.GemanMcClure(scale=0.02)])
+def test_slow_steps_are_gone_to_their_end(loss):
+    """Reweighted steps fall by a tenth only where many points are let go: beginning again changes nothing."""
+    rng = np.random.default_rng(3)
+    first, *rest = measured((0.0, 0.0, 0.0))[0]
+    disturbed = first + rng.choice([0.0, 0.03], (40, len(first))), *(np.broadcast_to(c, (40, len(c))) for c in rest)
+    pairs = jaxro.pair(*disturbed, focal=FOCAL)
+    orient = jax.jit(jax.vmap(lambda pair, start: jaxro.orient(pair, loss=loss, start=start)))
+    once = jax.jit(jax.vmap(lambda pair: jaxro.orient(pair, loss=loss, start=starts.Vertical())))(pairs)
+    again = orient(pairs, once.elements)
+    assert np.max(once.iterations) > 25 and np.mean(once.usable) > 0.9
+    np.testing.assert_allclose(again.sigma0[once.usable], once.sigma0[once.usable], rtol=1e-10)
 
 
 def test_weights_are_standard_deviations():

@@ -81,6 +81,12 @@ def test_reweighting_ends_where_numpy_does(function, count):
     assert np.mean(mask == ~wrong) > 0.95
 
 
+def test_the_evidence_of_reweighting_is_what_decided():
+    measured, _ = contaminated(60)
+    found = jaxro.clean_batch(jaxro.pair(*measured, focal=FOCAL), Reweighting(losses.Huber(), sigma=SIGMA))
+    np.testing.assert_array_equal(np.asarray(found.statistic) > 3.29, ~np.asarray(found.mask))
+
+
 def test_reweighting_that_does_not_rest_is_told():
     measured, _ = contaminated(100)
     few = decided(Reweighting(rounds=8), measured, lambda found: found.outcome == OUTCOMES.did_not_rest)

@@ -61,13 +61,15 @@ class Options:
 
 @dataclass
 class Summary:
-    """What became of the pairs: their number, matches and kept matches by kind; sigma0 of the oriented; seconds."""
+    """What became of the pairs: their number, matches and kept matches by kind; sigma0 of the oriented; keypoints at
+    which no ray is seen; geometries of pairs without matches; seconds."""
 
     pairs: Counter[Kind] = field(default_factory=Counter)
     matches: Counter[Kind] = field(default_factory=Counter)
     kept: Counter[Kind] = field(default_factory=Counter)
     sigma0: list[float] = field(default_factory=list)
     unseen: int = 0
+    untouched: int = 0
     seconds: float = 0.0
 
     def add(self, geometry: Geometry, kind: Kind, matches: int, sigma0: float) -> None:
@@ -112,6 +114,7 @@ def orient_database(options: Options, told: Callable[..., None] = lambda done, t
             database.write(new)
             for one, matches, kind, sigma0 in zip(new, of_block, found.kind, found.sigma0, strict=True):
                 summary.add(one, Kind(int(kind)), len(matches), float(sigma0))
+        summary.untouched = database.geometries() - len(numbers)
     summary.seconds = time.perf_counter() - begin
     return summary
 
@@ -239,6 +242,8 @@ def _show(console: Console, options: Options, summary: Summary) -> None:
     console.print(rows)
     if summary.unseen:
         console.print(f"{summary.unseen} keypoints lie where the distortion shows no ray; their matches are out.")
+    if summary.untouched:
+        console.print(f"Mind: {summary.untouched} geometries of pairs without a row in matches stay as they were.")
     if summary.sigma0:
         ratio = float(np.median(summary.sigma0))
         console.print(

@@ -68,6 +68,8 @@ def oriented(
 def _found(block: Block, points: PhotoPoints, size: int, sigma: float, told: Callable[[int], None]) -> Found:
     width = SEARCHED if size > FEW else FEW
     few, every = batch(block, points, width, sigma), batch(block, points, size, sigma)
+    without_repeats(few)
+    repeats = without_repeats(every)
     found, sure = _by(EIGHT, few, every, told)
     rest = np.flatnonzero(~(sure & (found.kind == Kind.oriented)) & (found.kind != Kind.too_few))
     if rest.size:
@@ -77,6 +79,8 @@ def _found(block: Block, points: PhotoPoints, size: int, sigma: float, told: Cal
             old[rest[take]] = new[take]
     found.kind[~sure & (found.kind != Kind.too_few)] = Kind.no_consensus
     found.kept[found.kind >= Kind.no_consensus] = False
+    for row, like in repeats.items():
+        found.kept[row] = found.kept[row, like]
     return found
 
 
@@ -96,6 +100,30 @@ def _all_searched(fields: tuple, *, search: Ransac) -> tuple:
 
 def _all_judged(found: tuple, *, chunk: int) -> Found:
     return chunked(lambda found: judged(Pair(*found[0]), found[1]), found, chunk)
+
+
+def without_repeats(fields: Fields) -> dict[int, Int[np.ndarray, "place"]]:
+    """Masks, in place, what repeats an earlier match of its pair: it is no evidence of its own. Of the pairs where this
+    happens, the place that every place is like."""
+    *coordinates, _, there = fields[:6]
+    found = {}
+    # what repeats another match is like it in any number made of them: one that is cheap, then one that tells
+    rows = _twice(coordinates[0].astype(np.float32), there)
+    mixed = np.sum([c[rows] * (k + 0.1) ** 0.5 for k, c in enumerate(coordinates)], axis=0)
+    rows = rows[_twice(mixed, there[rows])]
+    for row in rows.tolist():
+        points = np.stack([*(c[row] for c in coordinates), ~there[row]])
+        _, first, which = np.unique(points, axis=1, return_index=True, return_inverse=True)
+        found[row] = first[which.reshape(-1)]
+        there[row] &= found[row] == np.arange(there.shape[1])
+    return found
+
+
+def _twice(key: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """The rows in which a number stands twice."""
+    np.copyto(key, np.arange(2**20, 2**20 + there.shape[1], dtype=key.dtype), where=~there)
+    key.sort(axis=1)
+    return np.flatnonzero(np.any(key[:, 1:] == key[:, :-1], axis=1))
 
 
 def batch(block: Block, points: PhotoPoints, size: int, sigma: float) -> Fields:
