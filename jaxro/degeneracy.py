@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from . import coplanarity, rotations as rot
@@ -65,7 +64,7 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     minimum that the linearised statistics of the first know nothing of.
     """
     scaled, units = in_radians(elements, cofactor)
-    direction = _worst(scaled)
+    direction = stage(_worst)(scaled)
     length = jnp.sqrt(sum((e * e for e in direction), jnp.zeros(())))
     direction = [e / length * unit for e, unit in zip(direction, units, strict=True)]
     zero = jnp.zeros_like(pair.focal_left)
@@ -95,8 +94,9 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
     margin = jnp.where(drift > 0, jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0)), jnp.inf)
 
     by_entry = tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])
-    dot = lambda *x: sum(map(rot.dot, fundamental(*elements.moved(x).relative()), by_entry))
-    columns = stage(jax.grad(dot, argnums=(0, 1, 2, 3, 4)))(*(zero,) * 5)  # Aᵀc
+    _, slopes = elements.slopes(fundamental, (zero,) * 5)
+    dot = lambda m: sum(rot.dot(*rows) for rows in zip(m, by_entry, strict=True))
+    columns = stage(lambda slopes: [dot(m) for m in slopes])(slopes)  # Aᵀc
     taken = quadratic([list(row) for row in cofactor], columns)
     back = jnp.abs(sum(e * h for e, h in zip(direction, columns, strict=True)))
     straight = back <= 0
@@ -117,8 +117,9 @@ def _worst(cofactor: Float[Array, "p p"]) -> list:
         longer = row[k] > most
         column = [jnp.where(longer, a, b) for a, b in zip(row, column, strict=True)]
         most = jnp.where(longer, row[k], most)
-    multiplied = lambda column: [sum(a * b for a, b in zip(row, column, strict=True)) for row in q]
-    return lax.fori_loop(0, POWERS, lambda _, column: multiplied(column), column)
+    for _ in range(POWERS):
+        column = [sum(a * b for a, b in zip(row, column, strict=True)) for row in q]
+    return column
 
 
 def required(freedom: Float[Array, ""]) -> Float[Array, ""]:
