@@ -192,8 +192,10 @@ def loops(function: Callable) -> Callable:
 
 
 def part(function: Callable) -> Callable:
-    """Where kernels are made a kernel of its own, which the compiler makes better than a piece of a large one; elsewhere
-    a function of its own, whose loops are batched in a fifth less of the time."""
+    """Where kernels are made a kernel of its own, which the compiler makes better than a piece of a large one.
+
+    Elsewhere a function of its own, whose loops are batched in a fifth less of the time.
+    """
     return _call(function, **_AS_ONE) if _kernels.value else eqx.filter_jit(function)
 
 
