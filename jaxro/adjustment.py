@@ -207,9 +207,9 @@ def reweighted(loss: AbstractLoss | None, r: list[Array], weight: list[Array] | 
 
 
 def root(square: Array, there: Bool[Array, "..."] | bool = True) -> Array:
-    """The square root, zero where the square is not positive or not `there`; with finite derivatives."""
-    positive = (square > 0) & there
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+    """The square root, zero where the square is not positive or not `there`; with finite derivatives. NaN of NaN."""
+    there = ~(square <= 0) & there
+    return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
 
 
 def together(entries: list) -> Float[Array, " group"] | Float[Array, "group m"]:

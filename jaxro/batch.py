@@ -6,6 +6,7 @@ core, and nothing in the program calls LAPACK, which would deadlock. Pairs that 
 collected and oriented in a second, smaller pass, so that they do not hold up their chunk.
 """
 
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -14,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .orientation import Orientation, orient, orient_near
+from .elements import AbstractElements
+from .orientation import DEFAULTS, Orientation, orient, orient_near
 from .pairs import Pair, double
 from .programs import FAST, QUICK, QUICKEST, WIDE, Program, whole
 from .rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
@@ -79,10 +81,10 @@ def orient_batch(
     if read is not None and select is not _everything:
         raise ValueError("select and read exclude each other; read sees the orientation, too")
     host, report, way = jax.tree.map(np.asarray, double(pairs)), progress or unheard, Way(threads, chunk)
-    options = settled(options) | {"read": Selected(select) if read is None else read}
+    options = settled(options | {"start": start}) | {"read": Selected(select) if read is None else read}
     if not isinstance(start, Auto):
-        return _finish(oriented(host, options | {"start": start}, way, report))
-    out, fits = oriented_near(host, options | {"start": start}, way, report)
+        return _finish(oriented(host, options, way, report))
+    out, fits = oriented_near(host, options, way, report)
     rest = np.flatnonzero(~fits)
     if rest.size:
         left_over = jax.tree.map(lambda a: a[rest], host)
@@ -92,10 +94,18 @@ def orient_batch(
 
 
 def settled(options: dict[str, Any]) -> dict[str, Any]:
-    """The options of `orient`, a given base as an array: an argument, no program for each value."""
-    if options.get("base") is None:
-        return options
-    return options | {"base": jnp.asarray(options["base"], float)}
+    """The options of `orient`, a given base as an array: an argument, no program for each value. Raises TypeError for
+    what is none, ValueError for one of each pair."""
+    for name in set(options) - set(DEFAULTS):
+        raise TypeError(f"there is no option {name!r}: orient takes {', '.join(DEFAULTS)}")
+    base, start = options.get("base"), options.get("start")
+    for name, given in (("base", base), ("start", start if isinstance(start, AbstractElements) else None)):
+        if any(jnp.ndim(leaf) for leaf in jax.tree.leaves(given)):
+            raise ValueError(
+                f"`{name}` holds for all pairs of a batch; one of each pair goes with "
+                f"jax.jit(jax.vmap(lambda pair, {name}: orient(pair, {name}={name})))(pairs, {name})"
+            )
+    return options if base is None else options | {"base": jnp.asarray(base, float)}
 
 
 def oriented(
@@ -207,7 +217,7 @@ def _chunk(pairs: Pair, chunk: int | None) -> int:
     if pairs.x_left.ndim != 2:
         raise ValueError(f"a batch of pairs (pair, point) is wanted, got coordinates of shape {pairs.x_left.shape}")
     if chunk is not None:
-        return chunk
+        return operator.index(chunk)
     fitting = max(CHUNK_POINTS // max(pairs.x_left.shape[1], 1), 4)
     return min(128, 1 << fitting.bit_length() - 1)
 

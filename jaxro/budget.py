@@ -154,8 +154,14 @@ def error_budget(
     """How much of the variance of quantity(orient(pair, base=base, **options)) each of the independent sources costs.
 
     Without `base` lengths are relative: the mean x-parallax is taken as its length and as free of error. Works under
-    jit and vmap.
+    jit and vmap. Raises ValueError without any source, and for a standard deviation that is negative or not finite.
     """
+    if not sources:
+        raise ValueError("error_budget: give the sources of errors, such as {'focal length': FocalLength(0.01)}")
+    for name, source in sources.items():
+        for leaf in jax.tree.leaves(source):
+            if isinstance(leaf, int | float | np.ndarray) and not np.all(np.isfinite(leaf) & (np.asarray(leaf) >= 0)):
+                raise ValueError(f"error_budget: the standard deviations of {name!r} are to be finite and not negative")
     number = lambda leaf: jnp.asarray(leaf, pair.x_left.dtype) if isinstance(leaf, float | np.ndarray) else leaf
     more = {"sources": jax.tree.map(number, dict(sources)), "quantity": quantity}
     return run(_error_budget, pair, options | {"base": base}, more)

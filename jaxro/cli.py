@@ -121,7 +121,7 @@ def clean(
     options = Options(
         file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
     )
-    name, changes = procedure or DEFAULT, tolerance or []
+    name, changes = DEFAULT if procedure is None else procedure, tolerance or []
     if given.large(file, parquet, resume, tables, engine):
         from .io import large
 

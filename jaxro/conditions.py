@@ -34,6 +34,7 @@ class Linear(NamedTuple):
         return tuple(factor * b for b in self.gradient)
 
 
+@jax.jit  # traced once for all who ask
 def linearised(pair: Pair, pose: RelativePose) -> Linear:
     """The rigorous conditions of one pair at a pose, with its sigma; the pair is `cleaned`."""
     prepare, condition, observations, cofactor = coplanarity.rigorous(pair)

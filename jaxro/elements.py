@@ -291,8 +291,11 @@ def to_pose(elements: AbstractElements) -> RelativePose:
     return RelativePose(*rot.to_quaternion(rotation), *rot.unit(base))
 
 
-def convert(pose: RelativePose, system: type[AbstractElements], length: Scalar) -> AbstractElements:
-    """A unit pose in another system. `length`: bx of the dependent system (signed); unused by the others."""
+def convert(pose: AbstractElements, system: type[AbstractElements], length: Scalar) -> AbstractElements:
+    """Any elements in another system. `length`: bx of the dependent system, on the side where the right photo lies (the
+    other sign gives the elements of the opposite base); unused by the others."""
+    if not isinstance(pose, RelativePose):
+        pose = to_pose(pose)
     if system is RelativePose:
         return pose
     rotation, base = pose.relative()

@@ -32,6 +32,9 @@ UNROLLED = 12
 SINGULAR = 1e-12
 """Relative pivot below which a parameter counts as undetermined by those before it."""
 
+LEAST = 0.4
+"""Power of the smallest number of a type that is the smallest pivot: 1e-123 in double precision."""
+
 ROUNDING = 1e-10
 """Relative size of steps that have no use any more where they do not fall."""
 
@@ -72,7 +75,8 @@ def cholesky(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
     """L with N = L Lᵀ, the *inverses* of its diagonal in place of the diagonal, and the smallest relative pivot.
 
     The relative pivot of a parameter is the part of its diagonal that those before it leave over; pivots below the
-    rounding level are lifted to it, so that a singular system gives a large but finite solution.
+    rounding level are lifted to it, so that a singular system gives a large but finite solution; where all is zero, to
+    LEAST of the type, so that the squares of the inverse and its derivatives are finite, too.
     """
     factor: list[list[Scalar]] = []
     smallest = jnp.ones_like(n[0][0])
@@ -85,7 +89,7 @@ def cholesky(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
             if i > j:
                 new.append(s * factor[j][j])
             else:
-                floor = jnp.finfo(s.dtype).eps * row[i] + jnp.finfo(s.dtype).tiny
+                floor = jnp.finfo(s.dtype).eps * row[i] + jnp.finfo(s.dtype).tiny ** LEAST
                 smallest = jnp.minimum(smallest, s / (row[i] + jnp.finfo(s.dtype).tiny))
                 new.append(lax.rsqrt(jnp.maximum(s, floor)))
         factor.append(new)

@@ -223,7 +223,12 @@ def _inspected(
         (begin.ambiguous | second, RESULTS.two_solutions),
         (count(pair.mask & ~in_front & ~far & ~pair.coarse) > 0, RESULTS.points_behind_camera),
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
-        (~elements.exist(unit, length) | (noise**2 * worst_chosen > WEAK**2), RESULTS.elements_undefined),
+        (
+            ~elements.exist(unit, length)
+            | (noise**2 * worst_chosen > WEAK**2)
+            | (degeneracy.ROUNDING**2 * worst_chosen > worst),  # without redundancy there is no noise to judge by
+            RESULTS.elements_undefined,
+        ),
         ((noise**2 * worst > WEAK**2) | (direction.margin < needed * noise) | undivided, RESULTS.weakly_determined),
     ):
         result = RESULTS.where(fair & condition_holds, code, result)

@@ -16,6 +16,9 @@ from .adjustment import Adjustment, moved, root
 from .orientation import Orientation
 from .reductions import total
 
+ROUNDING = 1e-9
+"""Of the sum of all parts of a variance: as much below zero as it may come out by rounding."""
+
 
 def jacobian(function: Callable, values: PyTree, *, has_aux: bool = False) -> Any:
     """d function / d values, forward or reverse, whichever is less work: a reverse pass costs some two forward ones."""
@@ -38,8 +41,11 @@ def propagate(function: Callable, values: PyTree, covariance: ArrayLike) -> Prop
     """Propagation of variance through any differentiable function: C_y = J C Jᵀ, J = d function / d values.
 
     `covariance`: (p, p) of the p numbers of `values` laid one behind the other, or (p,) its diagonal. To first order:
-    exact for linear functions. Works under jit, vmap and grad.
+    exact for linear functions. Works under jit, vmap and grad. A variance that comes out negative, beyond rounding,
+    which no covariance gives, has the deviation NaN.
     """
+    exact = lambda a: not jnp.issubdtype(jnp.result_type(a), jnp.inexact)
+    values = jax.tree.map(lambda a: jnp.asarray(a, float) if exact(a) else a, values)
     flat, unravel = ravel_pytree(values)
     value = function(values)
     y, shaped = ravel_pytree(value)
@@ -47,8 +53,10 @@ def propagate(function: Callable, values: PyTree, covariance: ArrayLike) -> Prop
     c = jnp.asarray(covariance, flat.dtype)
     if c.shape not in ((flat.size,), (flat.size,) * 2):
         raise ValueError(f"propagate: {flat.size} values need a covariance of as many rows, got shape {c.shape}")
-    c = (j * c[None, :] if c.ndim == 1 else j @ c) @ j.T
-    return Propagated(value, shaped(root(jnp.diagonal(c)).astype(y.dtype)), c)
+    of = lambda j, c: (j * c[None, :] if c.ndim == 1 else j @ c) @ j.T
+    spread, size = jnp.diagonal(of(j, c)), jnp.diagonal(of(jnp.abs(j), jnp.abs(c)))
+    deviations = root(jnp.where(spread < -ROUNDING * size, jnp.nan, spread))
+    return Propagated(value, shaped(deviations.astype(y.dtype)), of(j, c))
 
 
 def propagate_each(function: Callable, values: PyTree, deviations: PyTree) -> PyTree:

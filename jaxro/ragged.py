@@ -130,30 +130,30 @@ def orient_ragged(
     Other keywords are those of `orient`. The results are those of `orient` one by one, to rounding.
     """
     pairs = checked(pairs)
-    plan = plan or planned(pairs.lengths)
-    options = settled(options) | {"read": read, "start": start}
+    plan = _fitting(plan, pairs)
+    options = settled(options | {"start": start}) | {"read": read}
     out = _Out(pairs, progress)
     rest = [np.zeros(0, int)]
     batches = _batches(pairs, plan.sizes, plan.slabs, threads)
     in_turn = threads == 1 or len(batches) == 1
     told = out.told if in_turn else unheard  # what runs beside the calling thread tells nobody
 
-    def near(members: np.ndarray, size: int, way: Way) -> tuple[np.ndarray, PyTree, np.ndarray]:
+    def near(members: np.ndarray, size: int, way: Way) -> tuple[np.ndarray, int, PyTree, np.ndarray]:
         found, fits = oriented_near(pairs.padded(members, size), options, way, told)
-        return members, found, members[~fits]
+        return members, size, found, members[~fits]
 
-    def given(members: np.ndarray, size: int, way: Way) -> tuple[np.ndarray, PyTree, np.ndarray]:
-        return members, oriented(pairs.padded(members, size), options, way, told), members[:0]
+    def given(members: np.ndarray, size: int, way: Way) -> tuple[np.ndarray, int, PyTree, np.ndarray]:
+        return members, size, oriented(pairs.padded(members, size), options, way, told), members[:0]
 
     first = near if isinstance(start, Auto) else given
-    for members, found, left in starmap(first, batches) if in_turn else _overlapping(first, batches):
-        out.store(members, found)
+    for members, size, found, left in starmap(first, batches) if in_turn else _overlapping(first, batches):
+        out.store(members, size, found)
         if not in_turn:
             out.told(len(members), len(members))
         rest.append(left)
     general = options | {"start": getattr(start, "general", start)}
     for members, size, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(rest)):
-        out.store(members, oriented(pairs.padded(members, size), general, way._replace(chunk=GENERAL)))
+        out.store(members, size, oriented(pairs.padded(members, size), general, way._replace(chunk=GENERAL)))
     return eqx.combine(*out.tree) if read is split else out.tree
 
 
@@ -186,24 +186,37 @@ def clean_ragged(
     `select(rejection)`: what is wanted instead, of the pair and of every point; the result then is these two.
     """
     pairs = checked(pairs)
-    plan = plan or planned(pairs.lengths)
+    plan = _fitting(plan, pairs)
     out = _Out(pairs, progress)
     every = stages(procedure, max(plan.sizes))
     doubtful = [[np.zeros(0, int)] for _ in every]  # by the number of procedures that are left for a pair
     for members, size, way in _batches(pairs, plan.sizes, None, threads):
         first, *others = stages(procedure, size)
         found, doubt = decided(pairs.padded(members, size), first, select, way, out.told)
-        out.store(members, found)
+        out.store(members, size, found)
         doubtful[len(others)].append(members[doubt])
     for left in range(len(every) - 1, 0, -1):
         for members, size, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(doubtful[left])):
             found, doubt = decided(pairs.padded(members, size), every[-left], select, way, unheard)
-            out.store(members, found)
+            out.store(members, size, found)
             doubtful[left - 1].append(members[doubt])
     if select is not decisions:
         return out.tree
     outcome, (kept, order, statistic) = out.tree
     return Decisions(kept, order, statistic, outcome)
+
+
+def _fitting(plan: Plan | None, pairs: Ragged) -> Plan:
+    """The plan, or one for these pairs. Raises ValueError if it is for shorter ones."""
+    if plan is None:
+        return planned(pairs.lengths)
+    longest, most = int(np.max(pairs.lengths)), min(plan.sizes[-1], plan.fewer[-1])
+    if longest > most:
+        raise ValueError(
+            f"the plan is for pairs of up to {most} points, but pair {int(np.argmax(pairs.lengths))} has {longest}: "
+            "plan with the longest of all parts"
+        )
+    return plan
 
 
 def _batches(
@@ -244,10 +257,17 @@ class _Out:
             self._before += total
         self._progress(self._before + (0 if done == total else done), len(self._pairs.lengths))
 
-    def store(self, members: np.ndarray, found: tuple[PyTree, PyTree]) -> None:
-        """The values of these pairs, and of their points in the rows of all."""
-        padded = [a.shape[1] for a in jax.tree.leaves(found[1])]
-        if len(members) == len(self._pairs.lengths) and np.all(self._pairs.lengths == max(padded, default=0)):
+    def store(self, members: np.ndarray, size: int, found: tuple[PyTree, PyTree]) -> None:
+        """The values of these pairs, and of their points in the rows of all. Raises ValueError for anything else."""
+        if not isinstance(found, tuple) or len(found) != 2:
+            raise ValueError("of ragged pairs two things are read: (what is of the pair, what is of every point)")
+        for of_points in jax.tree.leaves(found[1]):
+            if of_points.shape[:2] != (len(members), size):
+                raise ValueError(
+                    f"what is read of every point has the points on its first axis, {size} of them here, but a value "
+                    f"has the shape {of_points.shape[1:]}"
+                )
+        if len(members) == len(self._pairs.lengths) and np.all(self._pairs.lengths == size):
             # nothing to put in order
             self.tree = found[0], jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), found[1])
             return

@@ -302,7 +302,10 @@ def _moved(z: list[Array], weight: Array, jump: Array):
 
 @lru_cache(maxsize=64)
 def _tests(most: int, known: bool, level: float, power: float, familywise: bool) -> tuple[Any, ...]:
-    """delta0, limit of |w| and level of the test of a point, for pairs of 0 to `most` points."""
+    """delta0, limit of |w| and level of the test of a point, for pairs of 0 to `most` points. Raises ValueError."""
+    for name, probability in (("level", level), ("power", power)):
+        if not 0 < probability < 1:
+            raise ValueError(f"{name} is a probability, between 0 and 1, got {probability}")
     with jax.ensure_compile_time_eval():
         n = jnp.arange(most + 1.0)
         alone = critical.sidak(level, n) if familywise else jnp.full_like(n, level)

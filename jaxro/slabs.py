@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
@@ -109,8 +110,12 @@ def chunked(one: Callable, data: PyTree, chunk: int) -> PyTree:
     """`one` of everything on the leading axis, `chunk` at a time, which is a working set that stays in the cache and,
     where `one` is a loop, how many wait for the last of them."""
     count = jax.tree.leaves(data)[0].shape[0]
+    if count == 1:  # without batching, which traces every loop several times
+        return jax.tree.map(lambda a: jnp.asarray(a)[None], one(jax.tree.map(lambda a: a[0], data)))
     if count <= chunk:
         return jax.vmap(one)(data)
+    if chunk == 1:
+        return jax.lax.map(one, data)
     split = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), data)
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), jax.lax.map(jax.vmap(one), split))
 

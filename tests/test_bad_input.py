@@ -46,6 +46,16 @@ def test_elements_that_do_not_exist_or_are_nothing_but_errors(sigma):
     assert name(outcome(forward, elements=IndependentElements)) == "elements_undefined"
 
 
+@pytest.mark.parametrize("count", [5, 6])
+def test_elements_at_a_right_angle_do_not_exist_with_or_without_redundancy(count):
+    """phi = 90°: omega and kappa turn about the same axis. Five points have no errors to tell that by."""
+    across = photographed(block(12), turn=(0.0, np.pi / 2, 0.0), base=(3.0, 0.0, 0.0))
+    options = {"elements": DependentElements, "base": 3.0, "start": outcome(across).pose}
+    few = across.with_mask(jnp.arange(12) < count)
+    assert name(outcome(few, **options)) == "elements_undefined"
+    assert name(outcome(few, **options | {"elements": RelativePose})) == ("successful", "no_redundancy")[count == 5]
+
+
 def test_nonsense_coordinates_are_not_called_an_orientation():
     rng = np.random.default_rng(8)
     found = outcome(jaxro.pair(*rng.uniform(-100, 100, (4, 20)), focal=FOCAL))
@@ -151,6 +161,25 @@ def test_a_failing_neighbour_changes_no_bit():
     np.testing.assert_array_equal(
         slope(jaxro.stack([*good, *good[:4]])).x_left[:6], slope(jaxro.stack([*good, *bad])).x_left[:6]
     )
+
+
+def test_a_pair_without_a_base_leaves_the_derivatives_of_its_neighbours_finite():
+    """By a number that all pairs share; what has failed is selected away."""
+    good = photographed(block(8), turn=(0.01, 0.02, -0.01), sigma=0.01)
+    x, y = good.x_left, good.y_left
+    pairs = jaxro.stack([good, jaxro.pair(x, y, x, y, focal=FOCAL)])
+
+    def summed(focal):
+        def one(pair):
+            found = jaxro.orient(jaxro.pair(*pair.coordinates, focal=focal), start=jaxro.starts.Vertical())
+            values = found.cofactor[0, 0], found.sigma0, found.redundancy[0], found.model[2][0]
+            return jnp.where(found.usable, jnp.stack(values), 0.0)
+
+        return jnp.sum(jax.vmap(one)(pairs), axis=0)
+
+    reverse, forward = problems.jit(jax.jacrev(summed))(FOCAL), problems.jit(jax.jacfwd(summed))(FOCAL)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    assert np.all(forward != 0)
 
 
 def test_results_of_a_batch_say_which():

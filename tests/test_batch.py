@@ -14,6 +14,7 @@ import pytest
 
 import jaxro
 from jaxro import DependentElements, batch, program_store, simulation, starts
+from jaxro.elements import vertical
 from jaxro.memory import LARGE, Memory
 from jaxro.programs import FAST, Program, whole
 
@@ -93,9 +94,17 @@ def test_any_chunk_will_do(chunk):
     np.testing.assert_allclose(found, jaxro.orient_batch(few, select=_sigma0), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("wrong", [{"chunk": 0}, {"threads": 0}, {"threads": -1}])
-def test_what_cannot_be_is_refused(wrong):
-    with pytest.raises(ValueError, match="must be positive"):
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        *((wrong, "must be positive") for wrong in ({"chunk": 0}, {"threads": 0}, {"threads": -1})),
+        ({"losses": None}, "no option 'losses': orient takes elements"),
+        ({"base": np.ones(3)}, "`base` holds for all pairs of a batch"),
+        ({"start": vertical(jnp.ones(3))}, "`start` holds for all pairs of a batch"),
+    ],
+)
+def test_what_cannot_be_is_refused(wrong, message):
+    with pytest.raises((ValueError, TypeError), match=message):
         jaxro.orient_batch(mixed(), select=_sigma0, **wrong)
 
 

@@ -161,6 +161,9 @@ BAD_OPTIONS = {
     "no number": ([*PLAIN, "--tolerance", "factor=x"], ["factor=x", "a number"]),
     "negative": ([*PLAIN, "--tolerance", "factor=-1"], ["factor=-1", "not negative"]),
     "half a point": ([*PLAIN, "--tolerance", "least=6.5"], ["least=6.5", "a whole number"]),
+    "nothing is above it": (["--tolerance", "level=1.5"], ["level=1.5", "between 0 and 1"]),
+    "all are above it": (["--procedure", "igg3", "--tolerance", "limit=0"], ["limit=0", "above 0"]),
+    "empty": (["--procedure", ""], ["''", *PROCEDURES]),
     "infinite": ([*PLAIN, "--tolerance", "factor=inf"], ["factor=inf"]),
     "no focal length": (PLAIN, ["neither --focal nor --camera"]),
 }

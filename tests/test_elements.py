@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxro
-from jaxro import DependentElements, IndependentElements, rotations
+from jaxro import DependentElements, IndependentElements, RelativePose, rotations
 
 
 @pytest.mark.parametrize(
@@ -39,6 +39,6 @@ def test_a_photo_turned_by_a_right_angle_keeps_its_pose(system):
     """phi (omega2) of 90 degrees: single angles are undefined, what they say together is not."""
     angles = (0.3, np.pi / 2, 0.2) if system is DependentElements else (np.pi / 2, 0.2, 0.3)
     before = system(*map(jnp.asarray, (0.1, -0.2, *angles)), *([jnp.asarray(70.0)] * (system is DependentElements)))
-    after = jaxro.convert(jaxro.to_pose(before), system, jnp.asarray(70.0))
+    after = jaxro.convert(jaxro.convert(before, RelativePose, jnp.asarray(1.0)), system, jnp.asarray(70.0))
     for one, other in zip(jaxro.to_pose(before).relative(), jaxro.to_pose(after).relative(), strict=True):
         np.testing.assert_allclose(rotations.as_array(other), rotations.as_array(one), rtol=0, atol=1e-15)

@@ -79,6 +79,19 @@ def test_what_is_no_list_of_pairs_is_refused(pairs):
             call(nothing)
 
 
+def test_what_would_leave_results_unwritten_is_refused(together):
+    near = {"plan": PLAN, "start": jaxro.starts.Vertical()}
+    short = padding.planned(np.array([8]))
+    with pytest.raises(ValueError, match=r"up to 8 points, but pair 3 has 12"):
+        ragged.orient_ragged(together, plan=short)
+    with pytest.raises(ValueError, match=r"up to 8 points, but pair 3 has 12"):
+        ragged.clean_ragged(together, PROCEDURES["tau"], plan=short)
+    with pytest.raises(TypeError, match="no option 'chunk'"):
+        ragged.orient_ragged(together, chunk=3)
+    with pytest.raises(ValueError, match=r"points on its first axis, 12 of them here, .* shape \(3, 12\)"):
+        ragged.orient_ragged(together, **near, read=lambda pair, o: (None, jax.numpy.stack(o.model)))
+
+
 def test_cleaning_equals_one_by_one(pairs, together):
     procedure = PROCEDURES["worst-point"]
     found = ragged.clean_ragged(together, procedure, plan=PLAN)

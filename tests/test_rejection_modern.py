@@ -13,7 +13,7 @@ import jaxro
 from jaxro import losses, simulation
 from jaxro.rejection import OUTCOMES, AllSubsets, DataSnooping, LeastMedian, Ransac, Reweighting
 from jaxro.rejection.hypotheses import Newton, subsets
-from jaxro.rejection.least_median import upper_median
+from jaxro.rejection.least_median import median
 
 judge = pytest.importorskip("oracles_robust", reason="NumPy's critical values need scipy", exc_type=ImportError)
 
@@ -114,6 +114,40 @@ def test_all_subsets_finds_the_fewest_omissions_that_fit():
         assert tuple(np.flatnonzero(~kept)) == (best or ())
 
 
+def test_no_choice_of_omissions_is_told():
+    measured, wrong = contaminated(12, 10, most=3, largest=300.0)
+    outcome = decided(AllSubsets(most=1), measured, lambda found: found.outcome._value)
+    several = np.sum(wrong, axis=1) > 1
+    assert np.mean(outcome[several] == int(OUTCOMES.no_choice._value)) > 0.5
+    assert "Six points are left" not in OUTCOMES[OUTCOMES.no_choice]
+
+
+@pytest.mark.parametrize("procedure", [Ransac(hypotheses=Newton()), LeastMedian(), Reweighting(losses.Huber())])
+def test_of_five_points_none_is_tested(procedure):
+    measured, _ = contaminated(3, 6, most=1)
+    pairs = jaxro.pair(*measured, focal=FOCAL, sigma=SIGMA)
+    used = jnp.arange(6)[None, :] < jnp.array([1, 4, 5])[:, None]
+    found = jaxro.clean_batch(pairs.with_mask(used), procedure)
+    np.testing.assert_array_equal(found.mask, used)
+    assert np.all(found.outcome == OUTCOMES.nothing_to_test) and not np.any(found.statistic)
+
+
+def test_a_pose_that_no_weight_holds_is_not_at_rest():
+    """Every weight zero: the pose cannot move."""
+    measured, _ = contaminated(3)
+    outcome = decided(Reweighting(losses.IggThree(scale=1e-9, last=1e-8)), measured, lambda f: f.outcome._value)
+    assert np.all(outcome == int(OUTCOMES.did_not_rest._value))
+
+
+@pytest.mark.parametrize("points", [8, 12])
+def test_least_median_of_few_points_is_not_the_fit_of_five(points):
+    """Without errors: most points stay, and sigma0 is not far below the noise (a hundredth of it and less, if the
+    median were that of all points, of which a subset fits five exactly)."""
+    measured, _ = contaminated(100, points, most=0)
+    mask, sigma0 = decided(LeastMedian(), measured, lambda found: (found.mask, found.orientation.sigma0))
+    assert np.mean(mask) > 0.9 and 0.5 < np.median(sigma0) < 1.1
+
+
 def test_subsets_are_equally_likely():
     uniform = jnp.asarray(np.random.default_rng(1).random((5, 20_000), np.float32))
     drawn = np.sort(subsets(uniform, jnp.asarray(7.0)), axis=0)
@@ -125,8 +159,8 @@ def test_subsets_are_equally_likely():
 def test_median_without_sorting():
     rng = np.random.default_rng(2)
     values, use = np.exp(rng.normal(0, 9, (50, 31))), rng.random((50, 31)) < 0.7
-    found = jax.vmap(upper_median)(jnp.asarray(values), jnp.asarray(use))
-    expected = [np.sort(v[u])[np.sum(u) // 2] for v, u in zip(values, use, strict=True)]
+    found = jax.vmap(median)(jnp.asarray(values), jnp.asarray(use))
+    expected = [np.sort(v[u])[np.sum(u) // 2 + 2] for v, u in zip(values, use, strict=True)]
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

@@ -170,6 +170,23 @@ def test_elements_of_a_pose_are_its_local_parameters():
     np.testing.assert_allclose(sensitivity.displacement(named, named.moved(step)), np.array(step), atol=1e-14)
 
 
+def test_what_has_no_deviation_is_not_called_exact():
+    double, ones = lambda x: 2 * x, jnp.ones(2)
+    root_of = propagation.propagate(jnp.sqrt, jnp.array([-1.0, 4.0]), 0.01 * ones).deviations
+    np.testing.assert_allclose(root_of, [np.nan, 0.025])
+    np.testing.assert_array_equal(propagation.propagate(double, ones, jnp.array([-1.0, 1.0])).deviations, [np.nan, 2])
+    np.testing.assert_array_equal(propagation.propagate_each(double, ones, jnp.array([np.nan, 1.0])), [np.nan, 2])
+    pair = problems.tilted()
+    for wrong in (-1.0, np.nan):
+        with pytest.raises(ValueError, match="'focal length' are to be finite and not negative"):
+            budget.error_budget(pair, {"focal length": budget.FocalLength(wrong)})
+    with pytest.raises(ValueError, match="give the sources"):
+        budget.error_budget(pair, {})
+    for level in ({"level": 2.0}, {"power": 1.0}):
+        with pytest.raises(ValueError, match="between 0 and 1"):
+            jaxro.assess(pair, problems.orient(pair), **level)
+
+
 def test_propagation_equals_closed_forms():
     """Height from a parallax, h = B f / p, element by element; polar coordinates with a full covariance."""
     rng = np.random.default_rng(2)

@@ -182,6 +182,19 @@ def test_cleaning_keeps_every_row_with_its_verdict(folder, measured):
     np.testing.assert_allclose(q, [float(r["q_mm"] or "nan") for r in rows], atol=1e-8)
     assert pq.read_table(out / "residuals").num_rows == kept.sum()
 
+    # what holds no number is no point that the procedure rejected
+    lost, name = measured["pair"].index("p101"), "p101"
+    pq.write_table(
+        pa.table(wrong | {"x_left": [None if i == lost else x for i, x in enumerate(wrong["x_left"])]}),
+        folder / "lost.parquet",
+    )
+    assert run("clean", folder / "lost.parquet", *arguments[:-1], folder / "lost").exit_code == 1
+    before, after = (pq.read_table(place / "elements").to_pylist() for place in (out, folder / "lost"))
+    assert {row["pair"]: row["result"] for row in after}[name] == "non_finite_input"
+    assert [a for a in before if a["pair"] != name] == [b for b in after if b["pair"] != name]
+    row = pq.read_table(folder / "lost" / "cleaned").slice(lost, 1).to_pylist()[0]
+    assert (row["kept"], row["order"], row["statistic"]) == (False, 0, np.inf)
+
 
 def test_the_exit_code_tells_of_pairs_that_are_not_cleaned(folder):
     """As that of CSV tables: a pair that nothing was decided about is no success, whatever its orientation."""

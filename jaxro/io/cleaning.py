@@ -80,13 +80,13 @@ def clean_all(
 
     def one(pair: Pair):
         found, log = jax.tree.map(lambda a: a[0], clean_batch(stack([pair]), procedure, select=select))
-        kept = pair.with_mask(found.kept)
+        kept = _with_unusable(pair, found)
         oriented = job.read(orient(kept, **job.keywords), kept)
         return found, log, oriented, Program(_parallaxes, {}, QUICK)((pair, oriented.orientation.pose))
 
     def many(batch: Pair, progress: Callable[[int, int], None]):
         found, log = clean_batch(batch, procedure, select=select, progress=progress)
-        kept = batch.with_mask(found.kept)
+        kept = _with_unusable(batch, found)
         oriented = job.read(orient_batch(kept, **job.keywords), kept)
         return found, log, oriented, Program(_all_parallaxes, {})((batch, oriented.orientation.pose))
 
@@ -98,6 +98,11 @@ def clean_all(
         oriented[i] = _of_points(solved, np.flatnonzero(found.kept))
     every = range(len(job.pairs))
     return [verdicts[i] for i in every], [oriented[i] for i in every]
+
+
+def _with_unusable(pairs: Pair, found: judged.Decision) -> Pair:
+    """The points kept, and those that went without a round because they hold no numbers: as an orientation tells."""
+    return pairs.with_mask(np.asarray(pairs.mask) & (found.kept | (found.order == 0)))
 
 
 def _parallaxes(pair_and_pose: tuple[Pair, AbstractElements]) -> Float[Array, "point"]:

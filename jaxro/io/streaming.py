@@ -91,7 +91,8 @@ class Worker:
         if w.procedure is not None:
             outcomes, decided = clean_ragged(pairs, w.procedure, select=_decided, **how)
             kept = decided["kept"]
-            pairs = pairs._replace(mask=kept)
+            # with the points that went without a round because they hold no numbers: the orientation tells of them
+            pairs = pairs._replace(mask=pairs.mask & (kept | (decided["order"] == 0)))
         progress = lambda done, total: told(done)
         of_pair, of_points = orient_ragged(pairs, read=w.recorder, progress=progress, **how, **w.keywords)
         points = pairs.lengths if kept is None else np.add.reduceat(kept.astype(int), begins[:-1])

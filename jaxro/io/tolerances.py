@@ -10,6 +10,11 @@ import equinox as eqx
 from ..rejection import AbstractProcedure
 from .fields import TableError
 
+PROBABILITIES = frozenset({"level", "confidence", "share", "wrong"})
+
+POSITIVE = (PROBABILITIES - {"share"}) | {"sigma", "limit", "scale", "last", "count", "block", "shortlist", "margin"}
+"""Numbers without which a procedure rejects all points or none."""
+
 Number = bool | int | float | None
 
 
@@ -88,13 +93,15 @@ def _value(name: str, kind: type | None, text: str) -> Number:
         if text.lower() in ("true", "false"):
             return text.lower() == "true"
         raise TableError("--tolerance", None, None, f"{name}={text}", "true or false")
+    least, most = (0, 1) if name in PROBABILITIES else (0, math.inf)
     try:
         value = int(text) if kind is int else float(text)
     except ValueError:
-        value = -1
-    if value < 0 or not math.isfinite(value):
-        expected = "a whole number, not negative" if kind is int else "a number, not negative"
-        raise TableError("--tolerance", None, None, f"{name}={text}", expected)
+        value = math.nan
+    if not (least < value < most or (value == 0 and name not in POSITIVE)):
+        kinds = "a whole number" if kind is int else "a number"
+        size = "between 0 and 1" if most == 1 else "above 0" if name in POSITIVE else "not negative"
+        raise TableError("--tolerance", None, None, f"{name}={text}", f"{kinds}, {size}")
     return value
 
 

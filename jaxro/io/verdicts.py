@@ -52,7 +52,8 @@ def decision(found: Rejection) -> Decision:
     last = jnp.max(jnp.where(log.happened & jnp.isfinite(log.limit), number, -1))
     when = jnp.where(jnp.any(log.rejected, axis=0), jnp.argmax(log.rejected, axis=0), last)
     limit = jnp.where(when >= 0, log.limit[when], jnp.inf)
-    return Decision(found.mask, found.order, found.statistic, limit, found.outcome._value)
+    statistic = jnp.where(found.mask | (found.order > 0), found.statistic, jnp.inf)  # what holds no numbers
+    return Decision(found.mask, found.order, statistic, limit, found.outcome._value)
 
 
 def without_log(found: Rejection) -> tuple[Decision, None]:

@@ -29,7 +29,7 @@ class AllSubsets(AbstractProcedure):
     What a choice S leaves of Σ r² (r of sigma 1) is first computed from the solution of all points, to first order:
     Ω - r_S' (I - H_SS)⁻¹ r_S, H = A N⁻¹ A' (Cook and Weisberg 1982). The best `shortlist` of every number of omissions
     are then solved by `iterations` Gauss-Newton steps. A choice passes if Σ r² is at most the chi-squared value of
-    `level` for its n - 5 degrees of freedom. At least `least` points stay. No choice passes: `operator_needed`, and
+    `level` for its n - 5 degrees of freedom. At least `least` points stay. No choice passes: `no_choice`, and
     nothing is rejected. There are 2,516 choices of at most four of 16 points, and 14,892 of at most six; of many points
     fewer are left out, so that there are at most CHOICES (four of 50 points, two of 200).
     """
@@ -99,7 +99,7 @@ class AllSubsets(AbstractProcedure):
         w = jnp.where(pair.mask, normalised(linearised(pair, solved.pose), use), 0.0)
         limit = critical_values.by_count(lambda m: critical_values.normal(self.level + 0 * m), 1, count(use) * 0)
         new = Round(w, limit, omitted & pair.mask, solved.parallax, independent(solved.pose))
-        outcome = OUTCOMES.where(found, finished(pair), OUTCOMES.operator_needed)
+        outcome = OUTCOMES.where(found, finished(pair), OUTCOMES.no_choice)
         return ended(recorded(began(pair, 1), new), solved, outcome)
 
 

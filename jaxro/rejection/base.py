@@ -7,7 +7,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import coplanarity
@@ -16,6 +15,7 @@ from ..elements import AbstractElements, IndependentElements, RelativePose, conv
 from ..normal_equations import steps
 from ..orientation import Orientation, orient
 from ..pairs import Pair
+from ..programs import while_loop
 from ..reductions import count, total
 from ..results import is_usable
 
@@ -38,6 +38,10 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     did_not_rest = (
         "The weights did not come to rest, so that the points rejected depend on the number of rounds. Use another "
         "weight function, or the procedure `recommended`."
+    )
+    no_choice = (
+        "No choice of so few omissions as are tried passes the global test: more points are wrong, or the standard "
+        "deviation is too small. Use the procedure `recommended`."
     )
     not_oriented = "The points that were kept do not orient the pair; see the result of its orientation."
 
@@ -75,8 +79,8 @@ class Rejection(eqx.Module):
     outcome: OUTCOMES
 
     def only_if(self, fine: Bool[Array, ""], otherwise: OUTCOMES) -> "Rejection":
-        """The same decision, with another outcome where it is not fine."""
-        outcome = OUTCOMES.where(fine, self.outcome, otherwise)
+        """The same decision, with another outcome where it is not fine and there was something to test."""
+        outcome = OUTCOMES.where(fine | (self.outcome == OUTCOMES.nothing_to_test), self.outcome, otherwise)
         return Rejection(self.mask, self.order, self.statistic, self.log, self.orientation, outcome)
 
 
@@ -161,7 +165,8 @@ def repeated(judge: Callable[[Bool[Array, "point"], History], Round], history: H
         new = judge(history.mask, history)
         return recorded(history, new), count(new.rejected) > 0
 
-    return lax.while_loop(more, body, (history, jnp.asarray(most > 0) & (count(history.mask) > 0)))[0]
+    start = history, jnp.asarray(most > 0) & (count(history.mask) > 0)
+    return while_loop(more, body, start, history.log.limit.sum())[0]
 
 
 def largest(values: PointValues, use: Bool[Array, "point"]) -> Bool[Array, "point"]:

@@ -1,10 +1,10 @@
 """The algorithm proposed in 1971, exactly."""
 
 import jax.numpy as jnp
-from jax import lax
 
 from ..elements import AbstractElements
 from ..pairs import Pair, cleaned
+from ..programs import while_loop
 from ..reductions import count
 from .base import (
     OUTCOMES,
@@ -74,7 +74,7 @@ class Dorozhinsky(AbstractProcedure):
             return recorded(history, new), elements, wrong & few, ~wrong | few
 
         no = jnp.zeros_like(pair.focal_left, bool)
-        state = lax.while_loop(lambda state: ~state[3], cycle, (history, zero, no, no))
+        state = while_loop(lambda state: ~state[3], cycle, (history, zero, no, no), pair.focal_left)
         history, elements, stuck, _ = state
 
         def converge(state):
@@ -85,7 +85,7 @@ class Dorozhinsky(AbstractProcedure):
 
         go = ~stuck
         state = (history, elements, go, history.rounds * 0)
-        history, elements, _, _ = lax.while_loop(lambda s: s[2] & (s[3] < CONVERGENCE), converge, state)
+        history, elements, _, _ = while_loop(lambda s: s[2] & (s[3] < CONVERGENCE), converge, state, pair.focal_left)
         q = parallaxes(pair, history.mask, elements)
         excess = jnp.abs(q) - mean_of(jnp.abs(q), history.mask)
         bad = history.mask & (excess >= self.eps4)

@@ -20,12 +20,13 @@ BITS = 2 ** np.arange(30, -1, -1, dtype=np.int32)
 class LeastMedian(AbstractSearch):
     """Of the poses of `count` random subsets of five points the one with the least median r²; what is far from it goes.
 
-    s = 1.4826 (1 + 5/(n - 5)) sqrt(median r²) estimates sigma from the half of the points that fit best; points with
-    |r| > `limit` s are left out, the others solved by least squares, and by their sigma0 all are judged once more
-    (`rounds`). Nothing need be known of sigma (that of the pair counts as relative weight), and nearly half of the
-    points may be wrong. Its price: 2.5 s rejects one good point of eighty even where the estimate is good, and with few
-    points it is not, since the best of many poses of five points fits half of sixteen by chance. `count`: 150 subsets
-    hold one without a wrong point with probability .99 if half of the points are wrong.
+    The "median" is the r² of rank [n/2] + 3: of the p = 5 points of a subset r is zero, so that the rank is [(p+1)/2]
+    above n/2 (Rousseeuw and Leroy, chapter 3). s = 1.4826 (1 + 5/(n - 5)) sqrt(median r²) estimates sigma from the
+    points that fit best; points with |r| > `limit` s are left out, the others solved by least squares, and by their
+    sigma0 all are judged once more (`rounds`). Nothing need be known of sigma (that of the pair counts as relative
+    weight), and nearly half of the points may be wrong. Its price: 2.5 s rejects one good point of eighty even where
+    the estimate is good, and with few points it is too small, since the best of many poses fits most of them by chance.
+    `count`: 150 subsets hold one without a wrong point with probability .99 if half of the points are wrong.
     """
 
     hypotheses: AbstractHypotheses = Newton()
@@ -56,7 +57,7 @@ class LeastMedian(AbstractSearch):
 
         def searched(old, uniform):
             poses, exist = solutions(self.hypotheses, pair, points, begin, uniform)
-            medians = jax.vmap(lambda pose: upper_median(squares(pair, pose), pair.mask))(poses)
+            medians = jax.vmap(lambda pose: median(squares(pair, pose), pair.mask))(poses)
             medians = jnp.where(exist & jnp.isfinite(medians), medians, jnp.inf)
             lowest = jnp.min(medians)
             pick = lambda a, b: jnp.where(lowest < old[1], a, b)
@@ -66,14 +67,14 @@ class LeastMedian(AbstractSearch):
         return lax.scan(searched, nothing, draws(self.hypotheses, self.count, self.seed))[0]
 
 
-def upper_median(values: Values, use: Use) -> Float[Array, ""]:
-    """The value of rank n/2 + 1, rounded down, of those in use, none of them negative; to single precision.
+def median(values: Values, use: Use) -> Float[Array, ""]:
+    """The value of rank [n/2] + 3 of those in use, none of them negative, to single precision; NaN of four and fewer.
 
     Positive numbers are ordered as their bits are: bisection of these, without sorting.
     """
     bits = lax.bitcast_convert_type(values.astype(jnp.float32), jnp.int32)
     ones = use.astype(jnp.float32)
-    rank = jnp.floor(total(ones) / 2) + 1
+    rank = jnp.floor(total(ones) / 2) + 3
 
     def halved(low, bit):
         middle = low + bit

@@ -12,6 +12,7 @@ from .. import critical_values
 from ..conditions import linearised
 from ..elements import RelativePose, vertical
 from ..pairs import Pair, cleaned
+from ..programs import while_loop
 from ..reductions import count, total
 from .base import Rejection
 from .hypotheses import AbstractHypotheses, FivePoint, best, draws, moved_up, solutions, squares
@@ -89,7 +90,7 @@ class Ransac(AbstractSearch):
         # an empty pair, of those that fill up a batch, would run through all subsets
         wanted = jnp.where(count(pair.mask) >= self.hypotheses.size, jnp.inf, zero)
         start = Found(vertical(zero), zero + jnp.inf, zero.astype(int), wanted)
-        return lax.while_loop(more, searched, start)
+        return while_loop(more, searched, start, pair.focal_left)
 
     def optimised(self, pair: Pair, pose: RelativePose) -> RelativePose:
         """Gauss-Newton on the points within the wider limit, at last on those within the limit."""

@@ -14,6 +14,7 @@ from .. import critical_values
 from ..conditions import linearised
 from ..elements import RelativePose, vertical
 from ..pairs import Pair, cleaned
+from ..programs import while_loop
 from ..reductions import count, total
 from .base import OUTCOMES, AbstractProcedure, Rejection
 from .graduated_non_convexity import GraduatedNonConvexity
@@ -118,7 +119,7 @@ class Recommended(AbstractProcedure):
             new = [pose, use, self._accidents(pair, pose, use, limit)]
             return needed & False, *jax.tree.map(lambda a, b: jnp.where(needed, a, b), new, found)
 
-        return lax.while_loop(lambda state: state[0], again, (needed, pose, use, expected))[1:]
+        return while_loop(lambda state: state[0], again, (needed, pose, use, expected), pair.focal_left)[1:]
 
     def _accidents(self, pair: Pair, pose: RelativePose, use, limit) -> Float[Array, ""]:
         """Logarithm of the expected number."""

@@ -9,6 +9,8 @@ from ..conditions import linearised
 from ..elements import RelativePose
 from ..losses import AbstractWeight, Huber, Tukey
 from ..pairs import Pair, cleaned
+from ..programs import while_loop
+from ..reductions import count
 from ..starts import AbstractStart, Vertical
 from .base import OUTCOMES, Rejection
 from .robust import AbstractSearch, Values, judged, normalised, scaled, stepped
@@ -21,6 +23,9 @@ A function that lets go of a point has many local optima, and large errors spoil
 pairs of 16 points with up to three errors of 4 to 1,000 sigma Tukey's function alone cleans 57 % perfectly, after
 Huber's 87 %. It can also take a point up and let it go for ever: 10 % of these pairs, with the means none.
 """
+
+HOLDS = 1e-6
+"""Factor of a weight above which a point holds the pose."""
 
 
 class Reweighting(AbstractSearch):
@@ -70,8 +75,10 @@ class Reweighting(AbstractSearch):
 
         full = pair.mask.astype(pair.sigma.dtype)
         start = zero.astype(int), zero + jnp.inf, self.start(pair).pose, full
-        _, moved, pose, share = lax.while_loop(more, turn, start)
-        return moved <= self.tolerance, pose, share  # pyright: ignore[reportReturnType]
+        _, moved, pose, share = while_loop(more, turn, start, pair.focal_left)
+        # a pose that no five points hold cannot move, which is no rest
+        rests = (moved <= self.tolerance) & (count(share > HOLDS) >= 5)
+        return rests, pose, share  # pyright: ignore[reportReturnType]
 
 
 def _distance(one: RelativePose, other: RelativePose) -> Float[Array, ""]:

@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +14,9 @@ from ..elements import RelativePose
 from ..normal_equations import accumulate, cholesky, solve, substitute
 from ..orientation import orient
 from ..pairs import Pair
+from ..programs import while_loop
 from ..reductions import count, total
-from .base import AbstractProcedure, Rejection, Round, began, ended, finished, independent, recorded
+from .base import OUTCOMES, AbstractProcedure, Rejection, Round, began, ended, finished, independent, recorded
 
 Values = Float[Array, "point"]
 Use = Bool[Array, "point"]
@@ -33,14 +35,19 @@ class AbstractSearch(AbstractProcedure):
 
 def judged(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, w: Values | None = None) -> Rejection:
     """The verdict that only `use` are right, with the orientation of them and the evidence |w| against the limit: that
-    by which it was decided, or else that of this orientation."""
+    by which it was decided, or else that of this orientation; infinite where a point was rejected as it cannot be seen.
+    Of five points and fewer none can be tested."""
+    enough = count(pair.mask) > 5
+    use = jnp.where(enough, use, pair.mask)
     solved = orient(pair.with_mask(use), start=pose)
     if w is None:
         w = normalised(linearised(pair, solved.pose), use)
-    w = jnp.where(pair.mask, w, 0.0)
     limit = jnp.asarray(limit, w.dtype)
+    w = jnp.where(~use & (w <= limit) & ~seen(pair, solved.pose, limit), jnp.inf, w)
+    w = jnp.where(pair.mask & enough, w, 0.0)
     new = Round(w, limit, pair.mask & ~use, solved.parallax, independent(solved.pose))
-    return ended(recorded(began(pair, 1), new), solved, finished(pair))
+    outcome = OUTCOMES.where(enough, finished(pair), OUTCOMES.nothing_to_test)
+    return ended(recorded(began(pair, 1), new), solved, outcome)
 
 
 def in_single(tree: PyTree) -> PyTree:
@@ -126,6 +133,7 @@ def seen(pair: Pair, pose: RelativePose, limit: ArrayLike) -> Use:
     return in_front(pair, pose) | parallel(pair, pose, limit)
 
 
+@partial(jax.jit, static_argnames="rounds")
 def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int) -> tuple[RelativePose, Use]:
     """The pose of the points with |w| <= limit, found in turns: solve, judge every point anew.
 
@@ -139,9 +147,10 @@ def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds:
         new = pair.mask & (normalised(linearised(pair, pose), use) <= limit)
         return k + 1, (k == 0) | (count(new ^ use) > 0), pose, new
 
-    return _while_needed(rounds, jnp.asarray(True), turn, pose, use)[1:]
+    return _while_needed(rounds, jnp.asarray(True), turn, pair, pose, use)[1:]
 
 
+@partial(jax.jit, static_argnames="rounds")
 def one_by_one(
     pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int, wanted: Bool[Array, ""] | bool = True
 ):
@@ -170,7 +179,7 @@ def one_by_one(
         cost = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
         return k + 1, best > 0, pose, use ^ ((gain == best) & (best > 0)), cost
 
-    going, pose, use, cost = _while_needed(rounds, wanted, turn, pose, use, cut + jnp.inf)
+    going, pose, use, cost = _while_needed(rounds, wanted, turn, pair, pose, use, cut + jnp.inf)
     return (pose, use), cost, wanted & ~going
 
 
@@ -180,7 +189,7 @@ def improved(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
     return stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
 
 
-def _while_needed(rounds: int, needed: Bool[Array, ""], turn: Callable, *state: PyTree):
+def _while_needed(rounds: int, needed: Bool[Array, ""], turn: Callable, pair: Pair, *state: PyTree):
     """(needed, *state) after turns (k, needed, *state) -> the same, while needed and at most `rounds`."""
     start = (jnp.zeros((), int), needed, *state)
-    return jax.lax.while_loop(lambda state: state[1] & (state[0] < rounds), turn, start)[1:]
+    return while_loop(lambda state: state[1] & (state[0] < rounds), turn, start, pair.focal_left)[1:]

@@ -2,12 +2,12 @@
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool
 
 from ..elements import RelativePose, vertical
 from ..inspection import Inspection, inspect
 from ..pairs import Pair, cleaned
+from ..programs import while_loop
 from .base import AbstractStart, Begin, approached
 from .general import General
 
@@ -52,4 +52,4 @@ class Auto(AbstractStart):
             return jnp.zeros_like(state[0]), jax.tree.map(pick, found, state[1])
 
         no = jnp.zeros_like(fits)
-        return lax.while_loop(needed, general, (~fits, Begin(near, no, no)))[1]
+        return while_loop(needed, general, (~fits, Begin(near, no, no)), pair.focal_left)[1]
