@@ -115,15 +115,16 @@ class Program:
 
 def _flat(function: Callable, static: _Key) -> Callable:
     def flat(data: PyTree, arrays: dict[str, Any]) -> PyTree:
-        with _uncollected():
+        with uncollected():
             return function(data, **eqx.combine(arrays, static.tree))
 
     return flat
 
 
 @contextmanager
-def _uncollected() -> Iterator[None]:
-    """Without the garbage collector, which looks again and again through a trace of which nothing is garbage yet."""
+def uncollected() -> Iterator[None]:
+    """Without the garbage collector, which looks again and again through a trace, or a table, of which nothing is
+    garbage yet, and each time through all that JAX keeps."""
     collects = gc.isenabled()
     gc.disable()
     try:

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from ..experiments.tables import number, table
+from ..programs import uncollected
 from . import colmap_batches as batches
 from .colmap_batches import Block
 from .colmap_cameras import MODELS, PhotoCamera, PhotoPoints, photo_points
@@ -90,6 +91,7 @@ def run(options: Options) -> bool:
     return all(kind in GOOD for kind in summary.pairs)
 
 
+@uncollected()
 def orient_database(options: Options, told: Callable[..., None] = lambda done, total: None) -> Summary:
     """Orient every matched pair and write its geometry, all or none; told(done, total). Raises TableError."""
     if not (np.isfinite(options.sigma) and options.sigma > 0):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..pairs import Pair
-from ..programs import Program
+from ..programs import FAST, QUICK, Program
 from ..rejection.ransac import Ransac
 from ..slabs import Way, chunked, spread
 from .buckets import buckets
@@ -87,7 +87,8 @@ def _found(block: Block, points: PhotoPoints, size: int, sigma: float, told: Cal
 def _by(search: Ransac, few: Fields, every: Fields, told: Callable[[int], None]) -> tuple[Found, np.ndarray]:
     """What was found by this search, and where it sufficed."""
     heard = lambda done, total: told(done)
-    pose, tried = spread(few, Program(_all_searched, {"search": search}), Way(slab=PAIRS), 1, heard)
+    settings = FAST if search is EIGHT else QUICK  # few pairs need another search
+    pose, tried = spread(few, Program(_all_searched, {"search": search}, settings), Way(slab=PAIRS), 1, heard)
     chunk = max(1, IN_CACHE // every[0].shape[1])
     found = spread((every, pose), Program(_all_judged, {"chunk": chunk}), Way(slab=PAIRS), chunk)
     return found, suffices(search, tried, np.sum(found.kept, axis=1), np.sum(every[5], axis=1))
