@@ -54,9 +54,10 @@ def propagate(function: Callable, values: PyTree, covariance: ArrayLike) -> Prop
     if c.shape not in ((flat.size,), (flat.size,) * 2):
         raise ValueError(f"propagate: {flat.size} values need a covariance of as many rows, got shape {c.shape}")
     of = lambda j, c: (j * c[None, :] if c.ndim == 1 else j @ c) @ j.T
-    spread, size = jnp.diagonal(of(j, c)), jnp.diagonal(of(jnp.abs(j), jnp.abs(c)))
-    deviations = root(jnp.where(spread < -ROUNDING * size, jnp.nan, spread))
-    return Propagated(value, shaped(deviations.astype(y.dtype)), of(j, c))
+    spread = of(j, c)
+    variance, size = jnp.diagonal(spread), jnp.diagonal(of(jnp.abs(j), jnp.abs(c)))
+    deviations = root(jnp.where(variance < -ROUNDING * size, jnp.nan, variance))
+    return Propagated(value, shaped(deviations.astype(y.dtype)), spread)
 
 
 def propagate_each(function: Callable, values: PyTree, deviations: PyTree) -> PyTree:

@@ -101,8 +101,8 @@ def clean_all(
 
 
 def _with_unusable(pairs: Pair, found: judged.Decision) -> Pair:
-    """The points kept, and those that went without a round because they hold no numbers: as an orientation tells."""
-    return pairs.with_mask(np.asarray(pairs.mask) & (found.kept | (found.order == 0)))
+    """With the points kept, and the unusable ones, of which the orientation tells."""
+    return pairs.with_mask(np.asarray(pairs.mask) & (found.kept | judged.unusable(found.kept, found.order)))
 
 
 def _parallaxes(pair_and_pose: tuple[Pair, AbstractElements]) -> Float[Array, "point"]:

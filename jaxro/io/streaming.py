@@ -32,7 +32,7 @@ from .files import json_text
 from .records import Recorder
 from .solutions import NAMES, Units
 from .tables import Measurements
-from .verdicts import NAMES as OUTCOMES, decision
+from .verdicts import NAMES as OUTCOMES, decision, unusable
 
 PART_ROWS = 1 << 19
 """Rows of a part at most: its arrays take some 300 MB."""
@@ -91,8 +91,8 @@ class Worker:
         if w.procedure is not None:
             outcomes, decided = clean_ragged(pairs, w.procedure, select=_decided, **how)
             kept = decided["kept"]
-            # with the points that went without a round because they hold no numbers: the orientation tells of them
-            pairs = pairs._replace(mask=pairs.mask & (kept | (decided["order"] == 0)))
+            # of unusable points the orientation tells
+            pairs = pairs._replace(mask=pairs.mask & (kept | unusable(kept, decided["order"])))
         progress = lambda done, total: told(done)
         of_pair, of_points = orient_ragged(pairs, read=w.recorder, progress=progress, **how, **w.keywords)
         points = pairs.lengths if kept is None else np.add.reduceat(kept.astype(int), begins[:-1])

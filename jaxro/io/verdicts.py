@@ -52,8 +52,13 @@ def decision(found: Rejection) -> Decision:
     last = jnp.max(jnp.where(log.happened & jnp.isfinite(log.limit), number, -1))
     when = jnp.where(jnp.any(log.rejected, axis=0), jnp.argmax(log.rejected, axis=0), last)
     limit = jnp.where(when >= 0, log.limit[when], jnp.inf)
-    statistic = jnp.where(found.mask | (found.order > 0), found.statistic, jnp.inf)  # what holds no numbers
+    statistic = jnp.where(unusable(found.mask, found.order), jnp.inf, found.statistic)
     return Decision(found.mask, found.order, statistic, limit, found.outcome._value)
+
+
+def unusable(kept: Either, order: Either) -> Either:
+    """The points that went without a round, because they hold no numbers or were masked before."""
+    return ~kept & (order == 0)
 
 
 def without_log(found: Rejection) -> tuple[Decision, None]:

@@ -166,7 +166,7 @@ def repeated(judge: Callable[[Bool[Array, "point"], History], Round], history: H
         return recorded(history, new), count(new.rejected) > 0
 
     start = history, jnp.asarray(most > 0) & (count(history.mask) > 0)
-    return while_loop(more, body, start, history.log.limit.sum())[0]
+    return while_loop(more, body, start, jnp.sum(history.log.limit))[0]  # any number that differs from pair to pair
 
 
 def largest(values: PointValues, use: Bool[Array, "point"]) -> Bool[Array, "point"]:
