@@ -30,9 +30,6 @@ CHUNK_POINTS = 16384
 SEARCHED = 16
 """Pairs per chunk at most where random subsets are tried."""
 
-GENERAL = 8
-"""Pairs per chunk of the general start, which goes on until the last pair of its chunk is served."""
-
 ALONE = 1 << 14
 """Points of a batch that are oriented from the vertical before other threads have begun."""
 
@@ -88,7 +85,7 @@ def orient_batch(
     rest = np.flatnonzero(~fits)
     if rest.size:
         left_over = jax.tree.map(lambda a: a[rest], host)
-        again = oriented(left_over, options | {"start": start.general}, Way(threads, chunk or GENERAL), unheard)
+        again = oriented(left_over, options | {"start": start.general}, Way(threads, chunk), unheard)
         out = _replaced(out, rest, again)
     return _finish(out)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
-from .batch import GENERAL, Report, Way, decided, oriented, oriented_near, settled, stages, unheard
+from .batch import Report, Way, decided, oriented, oriented_near, settled, stages, unheard
 from .orientation import Orientation
 from .padding import Plan, planned
 from .pairs import Pair, double, pair
@@ -153,7 +153,7 @@ def orient_ragged(
         rest.append(left)
     general = options | {"start": getattr(start, "general", start)}
     for members, size, way in _batches(pairs, plan.fewer, None, threads, np.concatenate(rest)):
-        out.store(members, size, oriented(pairs.padded(members, size), general, way._replace(chunk=GENERAL)))
+        out.store(members, size, oriented(pairs.padded(members, size), general, way))
     return eqx.combine(*out.tree) if read is split else out.tree
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -153,9 +154,31 @@ def test_what_no_kernel_can_do_is_done_all_the_same(pairs):
     np.testing.assert_allclose(ranked, np.sort(jaxro.orient_batch(pairs).residuals), atol=1e-9)
 
 
-def test_no_lapack_in_the_batch_path(pairs, loop):
-    derivative = problems.jit(jax.grad(lambda p: jnp.sum(jax.vmap(jaxro.orient)(p).pose.qx), allow_int=True))
-    programs = (loop, set()), (derivative.lower(pairs).compile(), {"xla_ffi_python_cpu_callback"})
+@pytest.fixture(scope="module")
+def derivative(pairs):
+    """The compiled gradient of the sum of a pose's qx over the pairs."""
+    total = lambda p: jnp.sum(jax.vmap(jaxro.orient)(p).pose.qx)
+    return problems.jit(jax.grad(total, allow_int=True)).lower(pairs).compile()
+
+
+def test_derivatives_of_a_batch_are_differences(pairs, loop, derivative):
+    """Of pairs in any position among near-vertical ones, by the fourth point."""
+    gradient = np.asarray(derivative(pairs).y_left[:, 3])
+    step = 1e-4
+    moved = lambda h: loop(eqx.tree_at(lambda p: p.y_left, pairs, pairs.y_left.at[:, 3].add(h))).pose.qx
+    difference = (moved(step) - moved(-step)) / (2 * step)
+    usable = np.asarray(loop(pairs).usable)
+    assert np.sum(usable[::3]) > 40 and np.sum(usable) > 120
+    np.testing.assert_allclose(gradient[usable], difference[usable], rtol=1e-5, atol=1e-9)
+
+
+def test_a_batch_takes_little_memory(loop, pairs):
+    """A pair of nine points needs 150 kB for the general start, and only few are worked on at a time."""
+    assert loop.memory_analysis().temp_size_in_bytes < 150 * 40e3
+
+
+def test_no_lapack_in_the_batch_path(loop, derivative):
+    programs = (loop, set()), (derivative, {"xla_ffi_python_cpu_callback"})
     for program, allowed in programs:
         text = program.as_text()
         assert set(re.findall(r'custom_call_target="([^"]+)"', text)) <= allowed

@@ -135,7 +135,7 @@ def test_plane_has_two_solutions():
     assert name(outcome(photographed(relief, turn=(0.1, -0.2, 0.9), sigma=0.005))) == "successful"
 
 
-@pytest.mark.parametrize("count", [8, 12, 20])
+@pytest.mark.parametrize("count", [8, 12, 20, 150])
 def test_points_in_a_plane_do_not_say_which_of_two_orientations_is_right(count):
     """A plane in any position: both fit as well but for chance, so that hardly one is to be taken for certain."""
 

@@ -1,8 +1,8 @@
 """The start for photos in any position: candidates from closed forms, chosen by cheirality and residual.
 
 Candidates are the five-point solutions of several spread subsets, the eight-point solution and the vertical case. Those
-with most points in front of both photos and the smallest distances are refined by Gauss-Newton over all points, each
-different from the others, so that a second orientation that fits as well is seen and reported.
+with most points in front of both photos and the smallest distances are refined by Gauss-Newton, each different from the
+others, so that a second orientation that fits as well is seen and reported.
 """
 
 import jax
@@ -18,6 +18,7 @@ from ..elements import RelativePose, vertical
 from ..inspection import inspect
 from ..normal_equations import steps
 from ..pairs import Pair, cleaned, pad
+from ..selection import where_needed
 from .base import AbstractStart, Begin, distances
 from .decomposition import best_pose, cheirality
 from .eight_point import eight_point
@@ -27,6 +28,12 @@ EXACT = 1e-18
 """Mean square distance over f² that is rounding. Among such solutions, as five points have them, the first is taken:
 rounding would choose another one in another program."""
 
+JUDGES = 64
+"""Points that are enough to tell candidates apart; only the two best are refined by and compared over all points."""
+
+FINAL = 2
+"""Gauss-Newton steps of these two: what is right for the judges is nearly so for all."""
+
 BEHIND = 0.25
 """Share of points behind a photo above which a candidate counts as a wrong decomposition."""
 
@@ -35,6 +42,10 @@ ENOUGH = 10
 
 DIFFERENT = 0.05
 """Angle (rad) between rotations or bases from which two candidates are different orientations."""
+
+AT_ONCE, ON_DEVICES = 1 << 7, 1 << 17
+"""Points that are worked on together under a caller's `vmap`, at 15 kB each: what stays in the cache of a processor,
+and what keeps other devices busy."""
 
 
 class General(AbstractStart):
@@ -48,17 +59,26 @@ class General(AbstractStart):
     steps: int = 6
 
     def __call__(self, pair: Pair) -> Begin:
+        no = jnp.zeros_like(pair.focal_left, bool)
+        nothing = Begin(vertical(pair.focal_left), no, no)
+        points = AT_ONCE if jax.default_backend() == "cpu" else ON_DEVICES
+        most = max(points // max(pair.x_left.shape[0], 1), 1)
+        return where_needed(self._begin, jnp.any(pair.mask), lax.stop_gradient(pair), nothing, most)
+
+    def _begin(self, pair: Pair) -> Begin:
         pair = pad(pair, max(pair.x_left.shape[0], 1))  # of no points there are no candidates to choose from
         pair = _accurate(pair)
-        left, right = vectors(pair)
-        poses, real = self._candidates(pair, left, right)
-        score = jnp.where(real, _scores(pair, poses, left, right), jnp.inf)
-        chosen, found = _best_different(poses, score, self.refined)
-        chosen = jax.vmap(lambda pose: _refined(pair, pose, self.steps))(chosen)
-        score = jnp.where(found, _scores(pair, chosen, left, right), jnp.inf)
-        best, alone = _best_different(chosen, score, 2)
+        judges = _spread(pair, JUDGES)
+        poses, real = self._candidates(pair, judges)
+        chosen, found = _best_different(judges, poses, real, self.refined)
+        chosen = jax.vmap(lambda pose: _refined(judges, pose, self.steps))(chosen)
+        best, alone = _best_different(judges, chosen, found, 2)
+        if judges is not pair:
+            best = jax.vmap(lambda pose: _refined(pair, pose, FINAL))(best)
+            best, alone = _best_different(pair, best, alone, 2)
         first, second = (jax.tree.map(lambda a, i=i: a[i], best) for i in (0, 1))
         squares, other = (inspect(pair, pose).distance ** 2 for pose in (first, second))
+        left, right = vectors(pair)
         freedom = pair.count - 5
         ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
         ambiguous = ambiguous & (other < squares * excess(freedom) + EXACT)
@@ -69,7 +89,9 @@ class General(AbstractStart):
         pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
         return Begin(pose, ambiguous & ~pure, pure)
 
-    def _candidates(self, pair: Pair, left, right) -> tuple[RelativePose, Bool[Array, " candidate"]]:
+    def _candidates(self, pair: Pair, judges: Pair) -> tuple[RelativePose, Bool[Array, " candidate"]]:
+        """Poses, each with the base on whose side the judges see most points, and which of them are solutions."""
+        left, right = vectors(pair)
         pick = _subsets(pair.mask, self.subsets)
         gather = lambda vectors: jnp.sum(pick[:, :, :, None] * vectors[None, None, :, :], axis=2)
         essentials, real = jax.vmap(five_point)(gather(left), gather(right))
@@ -78,10 +100,26 @@ class General(AbstractStart):
         real = jnp.concatenate([real.reshape(-1), (pair.count >= 8)[None]])
         real = real & jnp.all(jnp.isfinite(essentials), axis=(1, 2))
         essentials = jnp.where(real[:, None, None], essentials, jnp.eye(3))
-        poses, _ = jax.vmap(lambda e: best_pose(e, left, right, pair.mask))(essentials)
+        seen = *vectors(judges), judges.mask
+        poses, _ = jax.vmap(lambda e: best_pose(e, *seen))(essentials)
         normal_case = jax.tree.map(lambda a: a[None], vertical(pair.focal_left))
         poses = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), poses, normal_case)
         return poses, jnp.concatenate([real, jnp.ones(1, bool)])
+
+
+def _spread(pair: Pair, count: int) -> Pair:
+    """At most so many of the points, evenly spread over the numbering."""
+    if pair.x_left.shape[0] <= count:
+        return pair
+    number = jnp.cumsum(pair.mask)
+    total = number[-1]
+    rank = jnp.arange(count)
+    rank = jnp.where(total > count, rank * total // count, rank)
+    use = rank < total
+    place = jnp.searchsorted(number, rank + 1)
+    *fields, _, left, right = jax.tree.leaves(pair)
+    *coordinates, sigma = (field.at[place].get(mode="clip") for field in fields)
+    return Pair(*(jnp.where(use, c, 0.0) for c in coordinates), jnp.where(use, sigma, 1.0), use, left, right)
 
 
 def _accurate(pair: Pair) -> Pair:
@@ -113,8 +151,9 @@ def _behind(pose: RelativePose, left, right, mask) -> Float[Array, ""]:
     return 1 - jnp.asarray(front, left.dtype) / total
 
 
-def _scores(pair: Pair, poses: RelativePose, left, right) -> Float[Array, " candidate"]:
+def _scores(pair: Pair, poses: RelativePose) -> Float[Array, " candidate"]:
     """Mean square distance over f², plus one where too many points lie behind a photo."""
+    left, right = vectors(pair)
 
     def one(pose):
         wrong = _behind(pose, left, right, pair.mask) > BEHIND
@@ -124,8 +163,9 @@ def _scores(pair: Pair, poses: RelativePose, left, right) -> Float[Array, " cand
     return jax.vmap(one)(poses)
 
 
-def _best_different(poses: RelativePose, score: Float[Array, " candidate"], count: int):
-    """The `count` best candidates that differ from one another, best first, and which of them exist."""
+def _best_different(pair: Pair, poses: RelativePose, real: Bool[Array, " candidate"], count: int):
+    """The `count` best of the real candidates that differ from one another, best first, and which of them exist."""
+    score = jnp.where(real, _scores(pair, poses), jnp.inf)
 
     def body(k, state):
         chosen, found, score = state
