@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool
 
 from ..elements import RelativePose, vertical
 from ..inspection import Inspection, inspect
-from ..pairs import Pair, cleaned
+from ..pairs import Pair
 from ..programs import while_loop
 from .base import AbstractStart, Begin, approached
 from .general import General
@@ -48,7 +48,7 @@ class Auto(AbstractStart):
         def general(state) -> tuple[Array, Begin]:
             pick = lambda new, old: jnp.where(state[0], new, old)
             with jax.named_scope("general"):
-                found = self.general(cleaned(pair.with_mask(pair.mask & state[0]))[0])
+                found = self.general(pair.with_mask(pair.mask & state[0]))
             return jnp.zeros_like(state[0]), jax.tree.map(pick, found, state[1])
 
         no = jnp.zeros_like(fits)

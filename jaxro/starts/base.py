@@ -24,7 +24,7 @@ class Begin(NamedTuple):
 
 
 class AbstractStart(eqx.Module):
-    """A way to begin the adjustment of one pair (finite coordinates, masked points zero)."""
+    """A way to begin the adjustment of one pair of finite coordinates, whatever its masked points hold."""
 
     @abc.abstractmethod
     def __call__(self, pair: Pair) -> Begin:
