@@ -228,4 +228,4 @@ def steps(residuals: Any, x: tuple[Scalar, ...], count: int, max_step: float) ->
     def body(_, x):
         return solver.step(lambda x, residuals: (residuals(x), None), x, residuals, {}, (x[0], x[0]), frozenset())[0]
 
-    return part(lambda x: lax.fori_loop(0, count, body, x))(x)
+    return part(lambda x: body(0, x) if count == 1 else lax.fori_loop(0, count, body, x))(x)

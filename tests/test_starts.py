@@ -10,9 +10,10 @@ import problems
 import pytest
 
 import jaxro
-from jaxro import rotations as rot
-from jaxro.elements import IndependentElements
+from jaxro import coplanarity, rotations as rot
+from jaxro.elements import IndependentElements, vertical
 from jaxro.starts import SixPoints, decomposition, six_points
+from jaxro.starts.base import FirstOrder, approached
 from jaxro.starts.eight_point import eight_point
 from jaxro.starts.five_point import five_point
 from jaxro.starts.null_space import null_space
@@ -317,6 +318,27 @@ def test_the_start_from_six_points_is_right_to_first_order():
         other = problems.orient(pair, start=SixPoints())
         np.testing.assert_allclose(other.pose.values(), solved.pose.values(), atol=1e-9)
         assert other.result == solved.result
+
+
+def test_first_order_equations_are_the_condition_at_zero_elements():
+    """g / (f1 f2) and its slopes there, two focal lengths; the pose they lead to is right to first order."""
+    pair = problems.tilted()
+    wide = jaxro.pair(pair.x_left, pair.y_left, 1.5 * pair.x_right, 1.5 * pair.y_right, focal=(100.0, 150.0))
+    focals = wide.focal_left, wide.focal_right
+
+    def condition(x):
+        f = coplanarity.fundamental_matrix(*vertical(focals[0]).moved(x).relative(), *focals)
+        return jax.vmap(lambda point: coplanarity.condition(f, point))(wide.coordinates) / (focals[0] * focals[1])
+
+    zero = (jnp.zeros(()),) * 5
+    (g,), slopes, _ = FirstOrder(wide).columns(zero)
+    np.testing.assert_allclose(g, condition(zero), rtol=0, atol=1e-14)
+    np.testing.assert_allclose([s[0] for s in slopes], jax.jacfwd(condition)(zero), rtol=0, atol=1e-14)
+    truth = jaxro.orient(pair).pose.quaternion
+    vertical_error, first, second = (
+        float(jnp.max(jnp.abs(approached(pair, count).quaternion - truth))) for count in range(3)
+    )
+    assert first < vertical_error**2 and second < 1e-4 * vertical_error
 
 
 def test_first_order_design_is_the_derivative_of_the_parallax():

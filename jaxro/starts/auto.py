@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ..elements import RelativePose, vertical
+from ..elements import RelativePose
 from ..inspection import Inspection, inspect
 from ..pairs import Pair
 from ..programs import while_loop
@@ -36,7 +36,7 @@ class Auto(AbstractStart):
         return (longest < self.tilt) & (inspected.distance < self.tolerance * jnp.minimum(1.0, 2 * inspected.spread))
 
     def __call__(self, pair: Pair) -> Begin:
-        near = approached(pair, vertical(pair.focal_left), self.steps)
+        near = approached(pair, self.steps)
         fits = self.fits(near, inspect(pair, near))
 
         # A loop of at most one round: under vmap it is entered only if some pair of the batch needs it, where a

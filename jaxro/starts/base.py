@@ -10,9 +10,12 @@ from jaxtyping import Array, Bool, PyTree
 
 from .. import coplanarity
 from ..adjustment import Residuals
-from ..elements import AbstractElements, RelativePose
+from ..elements import AbstractElements, RelativePose, vertical
 from ..normal_equations import steps
 from ..pairs import Pair
+
+LONGEST = 0.5
+"""Longest component of a step towards a start (rad)."""
 
 
 class Begin(NamedTuple):
@@ -38,16 +41,54 @@ def distances(pair: Pair, pose: RelativePose) -> Residuals:
     return Residuals(prepare, condition, pose, observations, unit, pair.mask)
 
 
-def approached(pair: Pair, pose: RelativePose, count: int) -> RelativePose:
-    """The pose after some Gauss-Newton steps in single precision, which are half the work and, far from the solution,
-    as good; unchanged where they fail."""
+class FirstOrder(NamedTuple):
+    """The condition of a pair to first order in the elements of near-vertical photos, for any point.
+
+    With x, y the coordinates over f of the left photo and u, v of the right one, which turns about its own axes,
+
+        g = v - y + (1 + y v) rx - y u ry + u rz - (x v - y u) b1 + (x - u) b2,
+
+    which Dorozhinsky (1971, eq. 5) has for the six standard zones.
+    """
+
+    pair: Pair
+
+    def columns(self, at: tuple[Array, ...]) -> tuple[list[Array], list[list[Array]], list[Array]]:
+        """g at zero elements, its five slopes, and the weights of the points."""
+        del at
+        pair = self.pair
+        left, right = 1 / pair.focal_left, 1 / pair.focal_right  # one division each: a point's would cost as much again
+        x, y, u, v = pair.x_left * left, pair.y_left * left, pair.x_right * right, pair.y_right * right
+        slopes = [[1 + y * v], [-y * u], [u], [y * u - x * v], [x - u]]
+        return [v - y], slopes, [jnp.where(pair.mask, 1 / pair.sigma**2, 0.0)]
+
+    def further(self, x: tuple[Array, ...], step: tuple[Array, ...]) -> tuple[Array, ...]:
+        """The elements after a step."""
+        return tuple(a + b for a, b in zip(x, step, strict=True))
+
+
+def approached(pair: Pair, count: int) -> RelativePose:
+    """The pose some Gauss-Newton steps from the vertical, which stays where they fail.
+
+    The first is by the first-order equations, a third of the work; the others are in single precision, which far from
+    the solution is as good.
+    """
+    pose = vertical(pair.focal_left)
     if count == 0:
         return pose
-    single, points = _with_dtype(jnp.float32, pose), _with_dtype(jnp.float32, pair)
-    zero = jnp.zeros_like(points.focal_left)
-    step = steps(distances(points, single), (zero,) * 5, count, 0.5)
+    zero = (jnp.zeros_like(pair.focal_left),) * 5
+    near = _moved(pose, steps(FirstOrder(pair), zero, 1, LONGEST))
+    if count == 1:
+        return near
+    single, points = _with_dtype(jnp.float32, near), _with_dtype(jnp.float32, pair)
+    zero = (jnp.zeros_like(points.focal_left),) * 5
+    return _moved(near, steps(distances(points, single), zero, count - 1, LONGEST))
+
+
+def _moved(pose: RelativePose, step: tuple[Array, ...]) -> RelativePose:
+    """The pose after a step of any precision, or unchanged where that is not finite."""
     fine = jnp.isfinite(sum(step))
-    there = _with_dtype(pair.focal_left.dtype, single.moved(step)).normalised()
+    there = pose.moved(_with_dtype(pose.qw.dtype, step)).normalised()
     return jax.tree.map(lambda new, old: jnp.where(fine, new, old), there, pose)
 
 

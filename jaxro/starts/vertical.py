@@ -2,19 +2,19 @@
 
 import jax.numpy as jnp
 
-from ..elements import vertical
 from ..pairs import Pair
 from .base import AbstractStart, Begin, approached
 
 
 class Vertical(AbstractStart):
-    """The normal case of aerial photography, and `steps` Gauss-Newton steps from it in single precision.
+    """The normal case of aerial photography, and `steps` Gauss-Newton steps from it.
 
-    Gauss-Newton reaches the solution from rotations of up to about 20°. With `steps` zero the elements begin at zero.
+    The first step is by first-order equations, the others are in single precision. Gauss-Newton reaches the solution
+    from rotations of up to about 20°. With `steps` zero the elements begin at zero.
     """
 
     steps: int = 2
 
     def __call__(self, pair: Pair) -> Begin:
         no = jnp.zeros_like(pair.focal_left, bool)
-        return Begin(approached(pair, vertical(pair.focal_left), self.steps), no, no)
+        return Begin(approached(pair, self.steps), no, no)
