@@ -9,15 +9,20 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .adjustment import Adjustment, moved, root
 from .orientation import Orientation
+from .programs import traced
 from .reductions import total
 
 ROUNDING = 1e-9
 """Of the sum of all parts of a variance: as much below zero as it may come out by rounding."""
+
+ASYMMETRY = 1e-3
+"""Difference of two covariances that are to be one, as a correlation: more than rounding leaves."""
 
 
 def jacobian(function: Callable, values: PyTree, *, has_aux: bool = False) -> Any:
@@ -42,7 +47,8 @@ def propagate(function: Callable, values: PyTree, covariance: ArrayLike) -> Prop
 
     `covariance`: (p, p) of the p numbers of `values` laid one behind the other, or (p,) its diagonal. To first order:
     exact for linear functions. Works under jit, vmap and grad. A variance that comes out negative, beyond rounding,
-    which no covariance gives, has the deviation NaN.
+    which no covariance gives, has the deviation NaN. Raises ValueError for another shape and, outside of
+    transformations, for a covariance that is not symmetric.
     """
     exact = lambda a: not jnp.issubdtype(jnp.result_type(a), jnp.inexact)
     values = jax.tree.map(lambda a: jnp.asarray(a, float) if exact(a) else a, values)
@@ -53,11 +59,22 @@ def propagate(function: Callable, values: PyTree, covariance: ArrayLike) -> Prop
     c = jnp.asarray(covariance, flat.dtype)
     if c.shape not in ((flat.size,), (flat.size,) * 2):
         raise ValueError(f"propagate: {flat.size} values need a covariance of as many rows, got shape {c.shape}")
+    if c.ndim == 2 and not traced(c):
+        _check_symmetric(np.asarray(c))
     of = lambda j, c: (j * c[None, :] if c.ndim == 1 else j @ c) @ j.T
     spread = of(j, c)
     variance, size = jnp.diagonal(spread), jnp.diagonal(of(jnp.abs(j), jnp.abs(c)))
     deviations = root(jnp.where(variance < -ROUNDING * size, jnp.nan, variance))
     return Propagated(value, shaped(deviations.astype(y.dtype)), spread)
+
+
+def _check_symmetric(c: np.ndarray) -> None:
+    size = np.sqrt(np.abs(np.diagonal(c)))
+    i, j = np.unravel_index(np.argmax(np.abs(c - c.T) > ASYMMETRY * np.outer(size, size)), c.shape)
+    if i != j:
+        raise ValueError(
+            f"propagate: a covariance is symmetric, but entry ({i}, {j}) is {c[i, j]:g} and ({j}, {i}) is {c[j, i]:g}"
+        )
 
 
 def propagate_each(function: Callable, values: PyTree, deviations: PyTree) -> PyTree:

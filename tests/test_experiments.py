@@ -106,7 +106,7 @@ def test_trials_have_their_errors_and_the_angle_is_that_of_the_oracle(shares):
     found = shares["right", 2].angle
     np.testing.assert_allclose(found.value, np.sqrt(np.mean(squares)), rtol=1e-6)
     # the standard error of a root from that of its square
-    np.testing.assert_allclose(found.error, np.std(squares) / math.sqrt(TRIALS) / 2 / found.value, rtol=1e-5)
+    np.testing.assert_allclose(found.error, np.std(squares, ddof=1) / math.sqrt(TRIALS) / 2 / found.value, rtol=1e-5)
     assert math.isnan(shares["all", 2].angle.value)  # no orientation, no angle
 
 

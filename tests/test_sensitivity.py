@@ -211,6 +211,8 @@ def test_propagation_equals_closed_forms():
     np.testing.assert_allclose(many[1], 2 * many[0], rtol=1e-13)
     with pytest.raises(ValueError, match="2 values need a covariance"):
         propagation.propagate(polar, values, np.eye(3))
+    with pytest.raises(ValueError, match=r"symmetric, but entry \(0, 1\) is 0.5 and \(1, 0\) is 0"):
+        propagation.propagate(polar, values, np.array([[1.0, 0.5], [0.0, 1.0]]))
 
 
 SOURCES = {

@@ -38,7 +38,7 @@ class Setting(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A mean over the trials and its standard error; NaN where there is nothing to average."""
+    """A mean over the trials and its standard error; NaN where there is nothing to average, or nothing to compare."""
 
     value: float
     error: float
@@ -188,9 +188,9 @@ def estimate(values: np.ndarray) -> Estimate:
     """Mean and standard error of the trials in which the value exists."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
-    if not values.size:
-        return Estimate(math.nan, math.nan)
-    return Estimate(float(np.mean(values)), float(np.std(values) / math.sqrt(values.size)))
+    mean = float(np.mean(values)) if values.size else math.nan
+    error = float(np.std(values, ddof=1) / math.sqrt(values.size)) if values.size > 1 else math.nan
+    return Estimate(mean, error)
 
 
 def root_mean_square(values: np.ndarray) -> Estimate:

@@ -1,5 +1,6 @@
 """A comparison of procedures as tables."""
 
+import math
 from collections.abc import Iterator
 from itertools import groupby
 from typing import TYPE_CHECKING
@@ -60,9 +61,15 @@ def _set(calibrations: dict[str, Calibration]) -> "Table":
 
 
 def _percent(e: Estimate) -> str:
-    exists = e.value == e.value
-    return f"{number(100 * e.value, 1)} ±{number(100 * e.error, 1)}" if exists else "-"
+    return _with_error(100 * e.value, 100 * e.error, 1)
 
 
 def _angle(s: Score) -> str:
-    return f"{number(s.angle.value, 2)} ±{number(s.angle.error, 2)}"
+    return _with_error(*s.angle, 2)
+
+
+def _with_error(value: float, error: float, digits: int) -> str:
+    """The value and its standard error, which a single trial does not have; a dash for what does not exist."""
+    if math.isnan(value):
+        return "-"
+    return number(value, digits) if math.isnan(error) else f"{number(value, digits)} ±{number(error, digits)}"
