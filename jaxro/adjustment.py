@@ -188,10 +188,11 @@ class Residuals(eqx.Module):
             (g, d), pull = jax.vjp(at, theta)
             if len(g) > 1:
                 r, push = jax.linearize(lambda theta: whitened(*at(theta), use), theta)
-                return r, [push(slope) for slope in along], None
+                full = lambda entry, slope: jnp.zeros_like(entry) if slope is None else slope
+                return r, [push(jax.tree.map(full, theta, slope)) for slope in along], None
             weight = jnp.where(use, 1 / d[0][0], 0.0)
             (gradient,) = pull(([jnp.ones_like(weight)], [[-0.5 * g[0] * weight]]))
-            return g, [[_dot(gradient, slope, ())] for slope in along], [weight]
+            return g, [[normal.inner(gradient, slope)] for slope in along], [weight]
 
         r, columns, weight = jax.vmap(one)(self.observations, self.cofactor, self.mask)
         return r, columns, reweighted(self.loss, r, weight)

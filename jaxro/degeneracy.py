@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from . import coplanarity, rotations as rot
 from .elements import AbstractElements
 from .inspection import Inspection
-from .normal_equations import quadratic
+from .normal_equations import inner, quadratic
 from .pairs import Pair
 from .programs import stage
 from .reductions import sums
@@ -95,8 +95,7 @@ def worst_direction(pair: Pair, elements: AbstractElements, cofactor: Float[Arra
 
     by_entry = tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])
     _, slopes = elements.slopes(fundamental, (zero,) * 5)
-    dot = lambda m: sum(rot.dot(*rows) for rows in zip(m, by_entry, strict=True))
-    columns = stage(lambda slopes: [dot(m) for m in slopes])(slopes)  # Aᵀc
+    columns = stage(lambda slopes: [inner(by_entry, slope) for slope in slopes])(slopes)  # Aᵀc
     taken = quadratic([list(row) for row in cofactor], columns)
     back = jnp.abs(sum(e * h for e, h in zip(direction, columns, strict=True)))
     straight = back <= 0

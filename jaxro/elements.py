@@ -19,12 +19,11 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from . import rotations as rot
-from .normal_equations import slopes
+from .normal_equations import directional, slopes
 from .rotations import Matrix, Vector
 
 Scalar = Float[Array, "..."]
@@ -149,11 +148,11 @@ class RelativePose(AbstractElements):
                 return function(rot.transpose((ordered[0], ordered[1], ordered[2])), base)
 
             back = tuple(-entry for entry in columns[i])
-            along.append(jax.jvp(turned, (columns[i], columns[j]), (columns[j], back))[1])
+            along.append(directional(turned, (columns[i], columns[j]), (columns[j], back))[1])
         first = self.bx, self.by, self.bz
         for tangent, t in zip(rot.tangents(first), x[3:], strict=True):
             direction = tuple(q - t / 2 * p for p, q in zip(first, tangent, strict=True))
-            value, slope = jax.jvp(lambda base: function(rotation, base), (base,), (direction,))
+            value, slope = directional(lambda base: function(rotation, base), (base,), (direction,))
             along.append(slope)
         return value, along
 
