@@ -19,6 +19,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from . import normal_equations as normal
 from .elements import AbstractElements
+from .guarded import root, times
 from .losses import AbstractLoss
 from .programs import part
 from .reductions import count
@@ -47,7 +48,7 @@ class Adjustment(eqx.Module):
 
     def covariance(self, sigma0: ArrayLike | None = None) -> Float[Array, "p p"]:
         """sigma0² Q: a posteriori, or a priori with the sigma0 given (1 where the cofactors are variances)."""
-        return (self.sigma0 if sigma0 is None else jnp.asarray(sigma0)) ** 2 * self.cofactor
+        return times(self.cofactor, (self.sigma0 if sigma0 is None else jnp.asarray(sigma0)) ** 2)
 
 
 def moved(parameters: Parameters, step: tuple) -> Parameters:
@@ -205,12 +206,6 @@ def reweighted(loss: AbstractLoss | None, r: list[Array], weight: list[Array] | 
     if weight is None:
         return [loss.weight(entry**2) for entry in r]
     return [w * loss.weight(w * entry**2) for w, entry in zip(weight, r, strict=True)]
-
-
-def root(square: Array, there: Bool[Array, "..."] | bool = True) -> Array:
-    """The square root, zero where the square is not positive or not `there`; with finite derivatives. NaN of NaN."""
-    there = ~(square <= 0) & there
-    return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
 
 
 def together(entries: list) -> Float[Array, " group"] | Float[Array, "group m"]:

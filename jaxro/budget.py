@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from .adjustment import root
+from .guarded import root
 from .orientation import orient
 from .pairs import Pair
 from .propagation import jacobian

@@ -19,8 +19,14 @@ Scalar = Float[Array, "..."]
 BISECTIONS = 120
 """Halvings of an interval: to the last bit of a double even near zero."""
 
+FEWER = 60
+"""The same for what is nowhere near zero, and takes a quadrature each."""
+
 WINDOW = 9.0
 """Standard deviations of a normal number outside which it is not looked for: 1e-19."""
+
+EACH, DENSITY = 64, 32
+"""Of tables by counts of points: up to which every count has an entry, and how many an octave has beyond."""
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(96)
 
@@ -105,7 +111,7 @@ def delta_student(level: ArrayLike, power: ArrayLike, freedom: ArrayLike) -> Sca
     limit = student(jnp.asarray(level, float) / 2, freedom)
     # s exceeds 1 + 9 / sqrt(f) hardly ever
     most = limit * (1 + 9 / jnp.sqrt(freedom)) + jnp.abs(ndtri(power)) + 1
-    return _where(lambda x: student_power(limit, freedom, x) < power, most, increasing=False)
+    return _where(lambda x: student_power(limit, freedom, x) < power, most, increasing=False, halvings=FEWER)
 
 
 def delta_chi_squared(level: ArrayLike, power: ArrayLike, freedom: ArrayLike) -> Scalar:
@@ -113,7 +119,7 @@ def delta_chi_squared(level: ArrayLike, power: ArrayLike, freedom: ArrayLike) ->
     freedom, power = jnp.asarray(freedom, float), jnp.asarray(power, float)
     limit = chi_squared(level, freedom)
     most = jnp.sqrt(limit) + jnp.abs(ndtri(power)) + 1
-    return _where(lambda x: chi_squared_power(limit, freedom, x) < power, most, increasing=False)
+    return _where(lambda x: chi_squared_power(limit, freedom, x) < power, most, increasing=False, halvings=FEWER)
 
 
 def b_method(level: ArrayLike, power: ArrayLike, freedom: ArrayLike) -> Scalar:
@@ -122,7 +128,7 @@ def b_method(level: ArrayLike, power: ArrayLike, freedom: ArrayLike) -> Scalar:
     freedom = jnp.asarray(freedom, float)
     delta, power = delta_normal(level, power), jnp.asarray(power, float)
     most = freedom + delta**2 + 20 * jnp.sqrt(freedom + delta**2) + 60
-    limit = _where(lambda x: chi_squared_power(x, freedom, delta) > power, most, increasing=False)
+    limit = _where(lambda x: chi_squared_power(x, freedom, delta) > power, most, increasing=False, halvings=FEWER)
     return gammaincc(freedom / 2, limit / 2)
 
 
@@ -162,12 +168,32 @@ def student_power(limit: ArrayLike, freedom: ArrayLike, delta: ArrayLike) -> Sca
 def by_count(value: Callable[[Array], Scalar], most: int, count: Float[Array, ""]) -> Float[Array, ""]:
     """value(count) for a count of 0 to `most` that is known only at run time: looked up, not calculated again."""
     with jax.ensure_compile_time_eval():
-        table = value(jnp.arange(most + 1.0))
-    here = jnp.arange(most + 1) == count.astype(int)
-    return jnp.sum(jnp.where(here, table, 0.0))
+        table = value(jnp.asarray(counts(most)))
+    return looked_up(table, count)
 
 
-def _where(above: Callable[[Array], Array], most: Array, increasing: bool) -> Scalar:
+def counts(most: int) -> Float[np.ndarray, " entry"]:
+    """The counts of a table for 0 to `most`: all up to `EACH`, then so dense that cubics join them."""
+    each = np.arange(min(most, EACH) + 1.0)
+    octaves = np.log2(max(most, EACH) / EACH)
+    return np.concatenate([each, EACH * 2 ** (np.arange(-1, octaves * DENSITY + 2) / DENSITY)] if octaves else [each])
+
+
+def looked_up(table: ArrayLike, count: Float[Array, ""]) -> Float[Array, ""]:
+    """The value at a count, of a table of the values at `counts`; beyond `EACH` by Lagrange's cubic of its logarithm,
+    which of the critical values of tests leaves an error below 1e-8."""
+    table = jnp.asarray(table)
+    each, beyond = table[: EACH + 1], table[EACH + 1 :]
+    value = jnp.sum(jnp.where(jnp.arange(each.size) == count.astype(int), each, 0.0))
+    if not beyond.size:
+        return value
+    away = jnp.abs(DENSITY * jnp.log2(jnp.maximum(count, 1.0) / EACH) - jnp.arange(-1.0, beyond.size - 1))
+    outer = jnp.where(away < 2, (1 - away) * (2 - away) * (3 - away) / 6, 0.0)
+    cubic = jnp.where(away < 1, (1 - away**2) * (2 - away) / 2, outer)
+    return jnp.where(count > EACH, jnp.sum(cubic * beyond), value)
+
+
+def _where(above: Callable[[Array], Array], most: Array, increasing: bool, halvings: int = BISECTIONS) -> Scalar:
     """The x in (0, most) at which `above` changes, by bisection."""
 
     def halved(_, interval):
@@ -176,7 +202,7 @@ def _where(above: Callable[[Array], Array], most: Array, increasing: bool) -> Sc
         down = above(middle) == increasing
         return jnp.where(down, low, middle), jnp.where(down, middle, high)
 
-    low, high = lax.fori_loop(0, BISECTIONS, halved, (jnp.zeros_like(most), most))
+    low, high = lax.fori_loop(0, halvings, halved, (jnp.zeros_like(most), most))
     return (low + high) / 2
 
 

@@ -30,6 +30,9 @@ Scalar = Float[Array, "..."]
 Step = tuple[Scalar, ...]
 """Five numbers"""
 
+NEVER = 1e-100
+"""What stands for a zero that would be divided by."""
+
 NOTHING = 1e-6
 """Component of a unit base that cannot be told from zero."""
 
@@ -269,7 +272,8 @@ class DependentElements(AbstractElements):
 
     @classmethod
     def scale(cls, base: Vector, length: Scalar) -> Scalar:
-        return length / base[0]
+        # an infinite scale would make the derivatives of a whole batch 0 * inf, though nobody uses it
+        return length / jnp.where(base[0] == 0, NEVER, base[0])
 
     @classmethod
     def exist(cls, base: Vector, length: Scalar) -> Bool[Array, "..."]:

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from . import coplanarity, rotations as rot
-from .adjustment import root
 from .conditions import Linear, Values
 from .elements import DependentElements, IndependentElements, RelativePose, convert
+from .guarded import root
 from .normal_equations import accumulate, quadratic
 from .orientation import Orientation
 from .pairs import Coordinates, Pair

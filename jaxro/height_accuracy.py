@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, PyTree
 
-from .adjustment import root
+from .guarded import root
 from .heights import Number
 from .reductions import total
 

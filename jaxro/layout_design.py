@@ -12,7 +12,7 @@ most 2 % above it; reported and compared are the largest values themselves.
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,8 +24,9 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from . import coplanarity, normal_equations as normal, rotations as rot
-from .adjustment import Adjustment, Residuals, read, root
+from .adjustment import Adjustment, Residuals, read
 from .elements import AbstractElements, DependentElements, vertical
+from .guarded import root
 from .pairs import Pair
 from .programs import QUICK, Program, traced
 from .reductions import total
@@ -58,12 +59,6 @@ class Overlap(eqx.Module):
     focal: ArrayLike
     terrain: Callable | ArrayLike = 0.0
     elements: AbstractElements | None = None
-
-
-def common_area(size: float, share: float, *, focal: float, **more: Any) -> Overlap:
-    """What two vertical square photos of side `size` both show if they share this part of it, say 0.6."""
-    base = (1 - share) * size
-    return Overlap((base - size / 2, size / 2), (-size / 2, size / 2), base, focal, **more)
 
 
 class Plan(NamedTuple):

@@ -22,7 +22,8 @@ from jax.ops import segment_sum
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import critical_values as critical
-from .adjustment import Adjustment, adjust, root
+from .adjustment import Adjustment, adjust
+from .guarded import root
 from .reductions import total
 from .reliability import UNTESTABLE
 from .results import RESULTS

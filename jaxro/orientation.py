@@ -12,8 +12,9 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import coplanarity, degeneracy, rotations as rot, starts
-from .adjustment import adjust, root
+from .adjustment import adjust
 from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
+from .guarded import root, times
 from .inspection import Inspection, inspect
 from .losses import AbstractLoss
 from .model_points import model_points
@@ -56,12 +57,12 @@ class Orientation(eqx.Module):
     @property
     def covariance(self) -> Float[Array, "*pairs 5 5"]:
         """sigma0² times the cofactors (a posteriori)."""
-        return self.sigma0[..., None, None] ** 2 * self.cofactor
+        return times(self.cofactor, self.sigma0[..., None, None] ** 2)
 
     @property
     def deviations(self) -> Float[Array, "*pairs 5"]:
         """Standard deviations of the elements."""
-        return self.sigma0[..., None] * jnp.sqrt(jnp.diagonal(self.cofactor, axis1=-2, axis2=-1))
+        return times(root(jnp.diagonal(self.cofactor, axis1=-2, axis2=-1)), self.sigma0[..., None])
 
     @property
     def correlation(self) -> Float[Array | np.ndarray, "*pairs 5 5"]:

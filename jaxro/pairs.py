@@ -160,7 +160,7 @@ def _filled(fields: list) -> Pair:
 
 
 def double(one: PyTree) -> PyTree:
-    """A `Pair`, or pairs of any form, in double precision, in which everything is adjusted.
+    """A `Pair`, or pairs of any form, in arrays of double precision, in which everything is adjusted.
 
     Raises ValueError where JAX has none.
     """
@@ -169,7 +169,13 @@ def double(one: PyTree) -> PyTree:
             "jaxro adjusts in double precision, which is switched off in JAX: leave JAX_ENABLE_X64 unset, or call "
             "jax.config.update('jax_enable_x64', True)"
         )
-    return jax.tree.map(lambda a: a.astype(float) if getattr(a, "dtype", None) == np.float32 else a, one)
+
+    def doubled(a):
+        if not hasattr(a, "dtype"):  # a number of Python, put into a field
+            return np.asarray(a, float)
+        return a.astype(float) if a.dtype == np.float32 else a
+
+    return jax.tree.map(doubled, one)
 
 
 def pad(one: Pair, points: int) -> Pair:

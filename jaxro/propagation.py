@@ -13,7 +13,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .adjustment import Adjustment, moved, root
+from .adjustment import Adjustment, moved
+from .guarded import root
 from .orientation import Orientation
 from .programs import traced
 from .reductions import total

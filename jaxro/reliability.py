@@ -27,9 +27,9 @@ from jax.scipy.special import betainc, gammainc, gammaincc, ndtr
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import critical_values as critical
-from .adjustment import root
 from .conditions import Linear, linearised
 from .external_reliability import effects
+from .guarded import root
 from .normal_equations import accumulate, inverse
 from .orientation import Orientation
 from .pairs import Coordinates, Pair, cleaned
@@ -139,12 +139,6 @@ class Reliability(eqx.Module):
         return xp.where(self.used, xp.where(testable, size, xp.inf), 0.0)
 
     @property
-    def largest_external(self) -> Float[Array | np.ndarray, "*pairs"]:
-        """The largest of `external`; infinite where the orientation is not usable."""
-        xp = namespace(self.w)
-        return xp.where(xp.any(self.used, axis=-1), xp.max(self.external, axis=-1), xp.inf)
-
-    @property
     def suspicious(self) -> Decided:
         """The points whose |w| exceeds the limit. Only the largest is evidence of an error in its own point."""
         return self.testable & (abs(self.w) > self.limit[..., None])
@@ -249,7 +243,7 @@ def _assess(read: tuple[Pair, Orientation], *, sigma0: Array | None, level: floa
     safe = jnp.where(testable, r, 1.0)
     spread = jnp.where(testable, jnp.sqrt(safe / jnp.where(testable, linear.weight, 1.0)), 1.0)  # sqrt(r D)
     tests = _tests(pair.mask.shape[0], known, level, power, familywise)
-    delta, limit, each = (critical.by_count(lambda _, t=t: t, pair.mask.shape[0], points) for t in tests)
+    delta, limit, each = (critical.looked_up(table, points) for table in tests)
     # of g: delta sigma0 sqrt(D / r), and what it does to the local parameters of the pose
     jump, shift = stage(_moved)(z, linear.weight, jnp.where(testable, delta * unit * spread / safe, 0.0))
     parts = tuple(b**2 * pair.sigma**2 * linear.weight * r for b in linear.gradient)
@@ -307,7 +301,7 @@ def _tests(most: int, known: bool, level: float, power: float, familywise: bool)
         if not 0 < probability < 1:
             raise ValueError(f"{name} is a probability, between 0 and 1, got {probability}")
     with jax.ensure_compile_time_eval():
-        n = jnp.arange(most + 1.0)
+        n = jnp.asarray(critical.counts(most))
         alone = critical.sidak(level, n) if familywise else jnp.full_like(n, level)
         if known:
             delta, limit = critical.delta_normal(alone, power), critical.normal(alone)

@@ -111,11 +111,14 @@ def run(function: Callable, pair: Pair, options: dict[str, Any], more: dict[str,
     """function(pair, **options, **more), compiled where nothing is traced, and begun at the solution if no start is
     given, so that the general start is in no program with derivatives."""
     if options.get("base") is not None:
-        options = options | {"base": jnp.asarray(options["base"], pair.x_left.dtype)}
+        options = options | {"base": jnp.asarray(options["base"], float)}
     if traced((pair, options, more)):
         return function(pair, **options, **more)
     if "start" not in options:
-        options = options | {"start": orient(pair, **options).pose}
+        found = orient(pair, **options)
+        options = options | {"start": found.pose}
+        if "max_steps" in options and not bool(found.usable):
+            options["max_steps"] = 0  # as many again might find what so many did not
     return Program(function, options | more, QUICK)(pair)
 
 

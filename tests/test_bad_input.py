@@ -163,16 +163,18 @@ def test_a_failing_neighbour_changes_no_bit():
     )
 
 
-def test_a_pair_without_a_base_leaves_the_derivatives_of_its_neighbours_finite():
+def test_failed_pairs_leave_the_derivatives_of_their_neighbours_finite():
     """By a number that all pairs share; what has failed is selected away."""
     good = photographed(block(8), turn=(0.01, 0.02, -0.01), sigma=0.01)
     x, y = good.x_left, good.y_left
-    pairs = jaxro.stack([good, jaxro.pair(x, y, x, y, focal=FOCAL)])
+    pairs = jaxro.stack([good, jaxro.pair(x, y, x, y, focal=FOCAL), good.with_mask(np.arange(8) < 4)])
 
     def summed(focal):
         def one(pair):
-            found = jaxro.orient(jaxro.pair(*pair.coordinates, focal=focal), start=jaxro.starts.Vertical())
+            new = jaxro.pair(*pair.coordinates, focal=focal, mask=pair.mask)
+            found = jaxro.orient(new, start=jaxro.starts.Vertical())
             values = found.cofactor[0, 0], found.sigma0, found.redundancy[0], found.model[2][0]
+            values = *values, found.covariance[0, 0], found.deviations[0]
             return jnp.where(found.usable, jnp.stack(values), 0.0)
 
         return jnp.sum(jax.vmap(one)(pairs), axis=0)
@@ -180,6 +182,24 @@ def test_a_pair_without_a_base_leaves_the_derivatives_of_its_neighbours_finite()
     reverse, forward = problems.jit(jax.jacrev(summed))(FOCAL), problems.jit(jax.jacfwd(summed))(FOCAL)
     np.testing.assert_allclose(reverse, forward, rtol=1e-9)
     assert np.all(forward != 0)
+
+
+def test_elements_that_do_not_exist_have_finite_derivatives():
+    def by(base):
+        direction = base, jnp.ones(()), jnp.zeros(())
+        length = jnp.asarray(70.0)
+        rotation = RelativePose(*map(jnp.asarray, (1.0, 0.0, 0.0, 0.0)), *direction).relative()[0]
+        elements = DependentElements.from_relative(rotation, direction, length)
+        return jnp.where(DependentElements.exist(direction, length), elements.by, 0.0)
+
+    assert by(jnp.zeros(())) == 0 and jax.grad(by)(jnp.zeros(())) == 0 and jax.grad(by)(jnp.ones(())) == -70
+
+
+def test_a_number_of_python_in_a_pair_is_one_also_under_a_trace():
+    pair = photographed(block(8), sigma=0.01)
+    given = eqx.tree_at(lambda p: p.focal_left, pair, FOCAL)
+    sigma0 = jax.jit(lambda base: jaxro.orient(given, base=base, start=jaxro.starts.Vertical()).sigma0)(70.0)
+    np.testing.assert_allclose(sigma0, jaxro.orient(pair).sigma0, rtol=1e-9)
 
 
 def test_results_of_a_batch_say_which():

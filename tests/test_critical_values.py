@@ -148,6 +148,22 @@ def test_by_count_looks_up_what_it_would_calculate():
     np.testing.assert_array_equal(looked_up(counts), value(counts))
 
 
+@pytest.mark.parametrize("most", [64, 10_000])
+def test_long_pairs_get_their_critical_values_from_a_short_table(most):
+    values = {
+        "grubbs": lambda n: critical.grubbs(0.05, n),
+        "normal": lambda n: critical.normal(0.01 / jnp.maximum(n, 1.0)),
+        "tau": lambda n: critical.tau(critical.sidak(0.05, n), jnp.maximum(n - 5, 2.0)),
+        "delta": lambda n: critical.delta_student(0.001, 0.8, jnp.maximum(n - 6, 1.0)),
+        "chi squared": lambda n: critical.chi_squared(0.05, jnp.maximum(n - 5, 1.0)),
+    }
+    count = jnp.asarray(np.unique(np.minimum([17, 63, 64, 65, 66, 67.0, 71, 99, 399, 3333, 9999, 10_000], most)))
+    assert critical.counts(most).size < 310
+    for name, value in values.items():
+        looked_up = jax.vmap(lambda n, value=value: critical.by_count(value, most, n))(count)
+        np.testing.assert_allclose(looked_up, value(count), rtol=1e-8, err_msg=name)
+
+
 def test_values_under_jit_are_the_same():
     level, freedom = jnp.asarray(0.01), jnp.asarray(11.0)
     for function in (critical.tau, critical.chi_squared, critical.grubbs):

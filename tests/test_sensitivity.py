@@ -10,6 +10,7 @@ import numpy as np
 import oracles
 import problems
 import pytest
+from mock_photos import block, photographed
 
 import jaxro
 from jaxro import (
@@ -138,6 +139,14 @@ def test_masked_points_have_no_derivative():
 def test_unusable_orientations_have_no_derivative():
     assert exact().usable.tolist() == [True, True, False]
     assert not any(np.any(leaf[2]) for name in FIELDS for leaf in jax.tree.leaves(getattr(exact(), name)))
+
+
+def test_steps_that_do_not_suffice_are_told():
+    pair = photographed(block(), turn=(0.1, -0.1, 0.1), sigma=0.01)
+    stopped = jaxro.orient(pair, max_steps=2)
+    found = sensitivity.derivatives(pair, lambda o: o.sigma0, max_steps=2)
+    assert not bool(stopped.usable) and not bool(found.usable)
+    np.testing.assert_allclose(found.value, stopped.sigma0, rtol=1e-12)
 
 
 def test_second_order_term():
