@@ -54,3 +54,28 @@ def in_any_position(points, count, seed, sigma):
             pairs.append(np.array(both) + rng.normal(size=(4, len(ground))) * sigma)
             truth.append(base)
     return np.stack(pairs, axis=1), np.stack(truth)
+
+
+def on_a_critical_surface(count, points, seed, sigma):
+    """`count` pairs in any position of which every point fits two orientations (R, b), (S, c), in front of all photos.
+
+    The right photo of a ray p lies where its two epipolar lines meet, (p.[b]R) x (p.[c]S). Coordinates and b.
+    """
+    rng, pairs, truth = np.random.default_rng(seed), [], []
+    span = FOCAL * 0.75
+    while len(pairs) < count:
+        angles, base = rng.uniform(-1, 1, 3) * (0.5, 0.5, np.pi), rng.normal(size=(2, 3)) * [[1.0], [0.5]]
+        first, second = (turned((*a,)).T for a in (angles, angles + rng.normal(size=3) * 0.3))
+        both = [(r, b / np.linalg.norm(b)) for r, b in ((first, base[0]), (second, base[0] + base[1]))]
+        p = np.column_stack([rng.uniform(-span, span, (200, 2)), np.full(200, -FOCAL)])
+        q = np.cross(*(np.cross(p, b) @ r for r, b in both))
+        q *= -FOCAL / q[:, 2:]
+        seen = np.max(np.abs(q[:, :2]), axis=1) < span
+        for r, b in both:
+            a, c = q @ r.T, np.cross(p, q @ r.T)
+            seen &= (np.sum(np.cross(b, a) * c, axis=1) > 0) & (np.sum(np.cross(b, p) * c, axis=1) > 0)
+        if np.sum(seen) >= points:
+            measured = np.concatenate([p[seen][:points, :2].T, q[seen][:points, :2].T])
+            pairs.append(measured + rng.normal(size=measured.shape) * sigma)
+            truth.append(both[0][1])
+    return np.stack(pairs, axis=1), np.stack(truth)

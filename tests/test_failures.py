@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mock_photos import FOCAL, block, in_any_position, name, outcome, photographed
+from mock_photos import FOCAL, block, in_any_position, name, on_a_critical_surface, outcome, photographed
 
 import jaxro
 from jaxro import RESULTS, DependentElements, degeneracy
@@ -150,6 +150,17 @@ def test_points_in_a_plane_do_not_say_which_of_two_orientations_is_right(count):
     wrong = np.sum(base * truth, axis=1) < np.cos(0.2)
     certain = np.asarray(found.result == RESULTS.successful)
     assert np.sum(wrong & certain) <= 3 and np.mean(found.result == RESULTS.two_solutions) > 0.3
+
+
+@pytest.mark.parametrize("count", [8, 10])
+def test_points_on_a_critical_surface_do_not_say_which_of_two_orientations_is_right(count):
+    coordinates, truth = on_a_critical_surface(400, count, 10, sigma := 0.01)
+    found = jaxro.orient_batch(jaxro.pair(*coordinates, focal=FOCAL, sigma=sigma))
+    base = np.stack([found.pose.bx, found.pose.by, found.pose.bz], axis=1)
+    wrong = np.sum(base * truth, axis=1) < np.cos(0.1)
+    certain = np.asarray(found.result == RESULTS.successful)
+    assert 0.3 < np.mean(wrong) < 0.6 and np.sum(certain) <= 6
+    assert np.mean(found.result == RESULTS.two_solutions) > 0.8
 
 
 @pytest.mark.parametrize("coarse", [3.0, 30.0])

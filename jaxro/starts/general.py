@@ -135,12 +135,20 @@ def vectors(pair: Pair) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"
 
 
 def _subsets(mask: Bool[Array, " point"], count: int) -> Float[Array, "subset 5 point"]:
-    """Five points each, evenly spread over the numbering and shifted from subset to subset, as selection matrices."""
-    number = jnp.cumsum(mask) - 1
+    """Five points each, spread over the numbering, no two subsets the same where there are more than five points.
+
+    As selection matrices. The points in the order of Fibonacci hashing, in which those that follow one another are far
+    apart, are a ring, of which the subsets are pieces that begin evenly spaced.
+    """
+    number = (jnp.cumsum(mask) - 1).astype(jnp.uint32)
     total = jnp.maximum(jnp.sum(mask), 1)
-    shift = jnp.arange(count)[:, None] * jnp.maximum(total // (5 * count), 1)
-    rank = (jnp.arange(5)[None, :] * total // 5 + shift) % total
-    return ((number[None, None, :] == rank[:, :, None]) & mask[None, None, :]).astype(jnp.result_type(float))
+    hashed = number * jnp.uint32(2654435769)  # 2³² over the golden ratio
+    ring = jnp.argsort(jnp.where(mask, hashed >> 1, jnp.uint32(1 << 31)))
+    begin = jnp.arange(count)[:, None] * jnp.maximum(total // count, 1)
+    pick = ring[(begin + jnp.arange(5)[None, :]) % total]
+    return ((pick[:, :, None] == jnp.arange(mask.size)[None, None, :]) & mask[None, None, :]).astype(
+        jnp.result_type(float)
+    )
 
 
 def _behind(pose: RelativePose, left, right, mask) -> Float[Array, ""]:
