@@ -9,11 +9,16 @@ stopped is resumed like any other, here or there.
 import json
 import logging
 import os
+import socket
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from . import program_store
+from .io.fields import TableError
 from .io.streaming import Job, Part, Work, Worker
+
+WAIT = 10.0
+"""Seconds in which a cluster answers."""
 
 
 def actor(work: Work) -> type:
@@ -41,12 +46,15 @@ def on_ray(job: Job, told: Callable[[int], None]) -> Iterator[dict[str, Any]]:
     try:
         import ray
         import ray.data
+        from ray.exceptions import RayError
     except ModuleNotFoundError:
         raise SystemExit("A cluster needs Ray: pip install 'jaxro[cluster]'") from None
     if not job.left:
         return
     if not ray.is_initialized():
-        ray.init(address=os.environ.get("RAY_ADDRESS"), log_to_driver=False, logging_level=logging.WARNING)
+        address = os.environ.get("RAY_ADDRESS")
+        _check_address(address)
+        ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
     ray.data.DataContext.get_current().enable_progress_bars = False
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     having = ray.cluster_resources()
@@ -59,8 +67,25 @@ def on_ray(job: Job, told: Callable[[int], None]) -> Iterator[dict[str, Any]]:
         actor(job.work), batch_size=1, batch_format="numpy", compute=pool, **each
     )
     done = job.done
-    for row in entries.iter_rows():
-        entry = json.loads(row["entry"])
-        done += entry["pairs"]
-        told(done)
-        yield entry
+    try:
+        for row in entries.iter_rows():
+            entry = json.loads(row["entry"])
+            done += entry["pairs"]
+            told(done)
+            yield entry
+    except RayError as error:
+        found = str(error).strip().splitlines()[-1]
+        expected = f"a table and a folder {job.work.folder} on a file system that all machines share"
+        raise TableError(job.work.file, None, None, found, f"{expected}; what is finished --resume keeps") from None
+
+
+def _check_address(address: str | None) -> None:
+    """Raises TableError where nothing answers at host:port, which Ray would go on trying."""
+    host, _, port = (address or "").removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host, int(port)), WAIT).close()
+    except (OSError, OverflowError) as error:
+        expected = "the address of a cluster that runs; or leave it unset for the cores of this machine"
+        raise TableError("RAY_ADDRESS", None, None, f"{address}: {error}", expected) from None

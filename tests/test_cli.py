@@ -174,6 +174,7 @@ BAD_OPTIONS = {
     "negative sigma": ([*FOCAL, "--sigma", "-1"], "-1.0"),
     "base of relative elements": ([*FOCAL, "--base", "3"], "relative"),
     "zero base": ([*FOCAL, "--base", "0", "--elements", "dependent"], "0.0"),
+    "a unit that is no name": ([*FOCAL, "--unit", "[/b]"], "'[/b]'"),
     "unknown elements": ([*FOCAL, "--elements", "absolute"], "absolute"),
     "two cameras": ([*FOCAL, "--camera", "camera.toml"], "beside --camera"),
     "tables of another kind": ([*FOCAL, "--tables", "points"], "--parquet"),
@@ -203,6 +204,9 @@ def test_results_are_overwritten_only_by_force(tmp_path):
     refused = run("--out", tmp_path)
     assert refused.exit_code == 2 and "--force" in refused.stderr and list(tmp_path.iterdir()) == [keep]
     assert run("--out", keep, "--force").exit_code == 2 and keep.read_text() == "mine"
+    for name, said in (("/", "the root of all folders"), (tmp_path / ("a" * 250), "too long")):
+        result = run("--out", name, "--force")
+        assert result.exit_code == 2 and said in result.stderr and not result.stdout
     assert run("--out", tmp_path, "--force").exit_code == 0
     assert {path.name for path in tmp_path.iterdir()} == FILES | {"notes.txt"} and keep.read_text() == "mine"
 

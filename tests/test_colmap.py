@@ -392,10 +392,13 @@ def test_a_locked_database_is_told(scene, tmp_path):
     shutil.copy(scene[0], own)
     other = sqlite3.connect(own, isolation_level=None)
     other.execute("PRAGMA busy_timeout = 0")
-    other.execute("BEGIN IMMEDIATE")
-    result = run(own)
+    other.execute("PRAGMA journal_mode = DELETE")  # in which a reader waits as well
+    other.execute("BEGIN EXCLUSIVE")
+    for more in ([], ["--out", tmp_path / "copy.db"]):
+        result = run(own, *more)
+        assert result.exit_code == 2 and "locked" in result.stderr and "nothing else writes" in result.stderr
+        assert not list(tmp_path.glob("*copy*"))
     other.close()
-    assert result.exit_code == 2 and "locked" in result.stderr and "nothing else writes" in result.stderr
 
 
 def test_every_kind_is_explained():

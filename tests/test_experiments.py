@@ -150,6 +150,7 @@ BAD_COMPARISONS = {
     "no trials": (["--trials", "0"], "1 or more"),
     "no share": (["--false-alarms", "5"], "5.0"),
     "camera of no table": (["--focal", "70"], "without FILE.csv"),
+    "unit of no table": (["--unit", "px"], "--unit"),
 }
 
 

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from jaxro.cli import app
 from jaxro.io import large
+from jaxro.io.fields import TableError
 from jaxro.io.job import Options
 from jaxro.io.streaming import JOURNAL, here
 
@@ -259,6 +260,48 @@ def test_force_replaces_results_and_nothing_else(folder, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "mine", "real"]
 
 
+def test_force_takes_the_place_of_no_folder_but_that_of_a_stopped_run(folder, tmp_path):
+    inside = tmp_path / "out.unfinished" / "table.parquet"
+    inside.parent.mkdir()
+    inside.write_bytes((folder / "table.parquet").read_bytes())
+    for table in (inside, folder / "table.parquet"):
+        found = run("orient", table, "--focal", FOCAL, "--out", tmp_path / "out", "--force")
+        assert found.exit_code == 2 and "table.parquet, no tables of an earlier run" in found.output
+        assert list(tmp_path.rglob("*")) == [inside.parent, inside]
+
+
+def test_a_stopped_run_outlives_a_call_that_cannot_work(folder, whole, tmp_path):
+    stopped = tmp_path / "out.unfinished"
+    with pytest.raises(KeyboardInterrupt):
+        stream(folder / "table.parquet", tmp_path / "out", engine=interrupted)
+    before = contents(stopped)
+    assert len(before) > 3
+    for table, options in (("typo.parquet", []), ("table.parquet", ["--camera", tmp_path / "typo.toml"])):
+        found = run("orient", folder / table, *(options or ["--focal", FOCAL]), "--out", tmp_path / "out", "--force")
+        assert found.exit_code == 2 and "typo" in found.output and contents(stopped) == before
+    assert list(tmp_path.iterdir()) == [stopped]
+    assert stream(folder / "table.parquet", tmp_path / "out", resume=True)
+    assert contents(tmp_path / "out") == contents(whole)
+
+
+def test_what_appears_in_the_folder_of_results_while_they_are_made_is_not_lost(folder, whole, tmp_path):
+    def disturbed(job, told):
+        yield from here(job, told)
+        job.target.mkdir()
+        (job.target / "mine.txt").write_text("mine")
+
+    with pytest.raises(TableError, match="not empty"):
+        stream(folder / "table.parquet", tmp_path / "out", engine=disturbed)
+    os.replace(tmp_path / "out" / "mine.txt", tmp_path / "mine.txt")
+    assert stream(folder / "table.parquet", tmp_path / "out", resume=True)
+    assert contents(tmp_path / "out") == contents(whole)
+
+
+def interrupted(job, told):
+    yield next(iter(here(job, told)))
+    raise KeyboardInterrupt
+
+
 def test_what_judges_by_sigma_is_not_run_without_one(folder):
     found = run("clean", folder / "table.parquet", "--focal", FOCAL, "--out", folder / "unjudged")
     assert found.exit_code == 2 and "neither --sigma nor a column sigma" in found.output
@@ -321,6 +364,7 @@ BAD = {
     "type": (lambda t: t | {"x_left": [str(x) for x in t["x_left"]]}, "column x_left: found values of type string"),
     "unnamed": (lambda t: t | {"pair": [None, *t["pair"][1:]]}, "column pair: found nothing in row 1"),
     "nameless": (lambda t: t | {"point": [*t["point"][:-1], None]}, "column point: found nothing in row"),
+    "blank": (lambda t: t | {"point": [*t["point"][:-1], " "]}, "column point: found nothing in row"),
     "empty": (lambda t: {k: v[:0] for k, v in pa.table(t).to_pydict().items()}, "found no"),
 }
 
@@ -344,6 +388,16 @@ def test_bad_csv_names_the_line(folder, measured):
     found = run("orient", folder / "letter.csv", "--focal", FOCAL, "--parquet", "--out", folder / "letter")
     assert found.exit_code == 2 and "line 301, column y_left: found '1O.5'" in found.output
     assert not (folder / "letter.unfinished").exists()
+    (folder / "letter.csv").write_text("point,x_left,y_left,x_right,y_right\n\n")
+    found = run("orient", folder / "letter.csv", "--focal", FOCAL, "--parquet", "--out", folder / "letter")
+    assert found.exit_code == 2 and "line 2: found no points" in found.output
+
+
+def test_a_cluster_that_does_not_answer_is_told(folder, tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    found = run("orient", folder / "table.parquet", "--focal", FOCAL, "--engine", "ray", "--out", tmp_path / "out")
+    assert found.exit_code == 2 and "RAY_ADDRESS: found 127.0.0.1:1" in found.output
 
 
 CLUSTER = """

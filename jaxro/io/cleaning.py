@@ -51,9 +51,9 @@ def run(options: Options, name: str, changes: list[str]) -> bool:
         heading = {"program": summary["program"], "file": summary["file"], "procedure": name}
         texts = judged.texts(verdicts, job.units.photo, heading | {"tolerances": tolerances(procedure)})
         texts |= files.texts(solved, job.units, summary)
-    jobs.write(job, texts)
     verdict_report.show(console, verdicts, name, job.units.photo)
     jobs.show(console, job, solved)
+    jobs.write(job, texts)
     jobs.tell(console, job, texts)
     if options.file is None:
         console.print("This was a simulated example. Your own pairs: jaxro clean FILE.csv --focal F", markup=False)

@@ -9,7 +9,7 @@ are not written; tables that are not named here are not touched.
 import os
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -134,6 +134,8 @@ class Database:
             yield values.astype(np.int64).reshape(rows, 2)
 
     def _array(self, table: str, row: str, column: str, data: bytes | None, dtype: np.dtype, count: int, why: str):
+        if isinstance(data, str):
+            raise self.error(table, row, column, "text", "bytes")
         size = len(data or b"")
         if size != count * dtype.itemsize:
             expected = f"{count * dtype.itemsize} bytes: {why} {count} numbers of {dtype.itemsize} bytes"
@@ -184,13 +186,16 @@ def opened(file: Path, out: Path | None, force: bool) -> Iterator[Database]:
     check_file(out, force)
     draft = out.absolute().with_name(f".{out.name}.{os.getpid()}.partial")
     try:
-        with _said(file):
+        with _said(file, out):
             draft.parent.mkdir(parents=True, exist_ok=True)
             with closing(_connection(draft)) as connection:
                 # a draft that is not finished is thrown away: it needs no journal, and the disk waits until it is
                 connection.execute("PRAGMA journal_mode = MEMORY")
                 connection.execute("PRAGMA synchronous = OFF")
-                with closing(_connection(file)) as source:
+                with _said(file), closing(_connection(file)) as source:
+                    source.execute(
+                        "SELECT count(*) FROM sqlite_master"
+                    )  # waits for a lock for a while, a backup for ever
                     source.backup(connection)
                 with _transaction(connection, file) as database:
                     _refuse(database, force)
@@ -201,7 +206,8 @@ def opened(file: Path, out: Path | None, force: bool) -> Iterator[Database]:
             os.replace(draft, out)
     finally:
         for end in ("", "-wal", "-shm", "-journal"):
-            draft.with_name(draft.name + end).unlink(missing_ok=True)
+            with suppress(OSError):
+                draft.with_name(draft.name + end).unlink(missing_ok=True)
 
 
 def _connection(path: Path) -> sqlite3.Connection:
@@ -220,17 +226,18 @@ def _transaction(connection: sqlite3.Connection, name: Path) -> Iterator[Databas
 
 
 @contextmanager
-def _said(file: Path) -> Iterator[None]:
-    """What SQLite and the disk complain of, as an error that says what to do."""
+def _said(file: Path, written: Path | None = None) -> Iterator[None]:
+    """What SQLite and the disk complain of, as an error that says what to do; `written`: the copy, if there is one."""
     try:
         yield
     except sqlite3.OperationalError as error:
         expected = "a database that nothing else writes to, in a folder that can be written; or --out for a copy"
-        raise TableError(file, None, None, str(error), expected) from None
+        raise TableError(written or file, None, None, str(error), expected) from None
     except sqlite3.DatabaseError as error:
         raise TableError(file, None, None, str(error), "a sound SQLite database made by COLMAP") from None
     except OSError as error:
-        raise TableError(file, None, None, error.strerror or str(error), "a file that can be written") from None
+        found = error.strerror or str(error)
+        raise TableError(written or file, None, None, found, "a file that can be written") from None
 
 
 def _refuse(database: Database, force: bool) -> None:

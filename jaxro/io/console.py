@@ -12,7 +12,7 @@ def consoles() -> tuple[Console, Console]:
     """(for reports, for warnings and progress)."""
     # text that goes to a file or a pipe is not wrapped at 80 columns
     wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200
-    return Console(width=wide, highlight=False), Console(stderr=True, highlight=False)
+    return Console(width=wide, highlight=False, emoji=False), Console(stderr=True, highlight=False, emoji=False)
 
 
 @contextmanager

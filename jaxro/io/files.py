@@ -24,15 +24,24 @@ from .solutions import Solution, Units
 
 def check_target(directory: Path, force: bool) -> None:
     """Raises TableError unless a result may be written there."""
-    try:
-        directory.exists()
-    except OSError as error:
-        found = error.strerror or str(error)
-        raise TableError(directory, None, None, found, "a name for the folder of results") from None
+    check_name(directory, "a name for the folder of results")
     if directory.exists() and not directory.is_dir():
         raise TableError(directory, None, None, "a file", "the name of a folder for the results")
     if not force and directory.exists() and any(directory.iterdir()):
         raise TableError(directory, None, None, "a folder that is not empty", "a new folder, or --force to overwrite")
+
+
+def check_name(path: Path, expected: str) -> None:
+    """Raises TableError where the disk knows no such name, or none for a draft beside it."""
+    whole = path.resolve()
+    if not whole.name:
+        raise TableError(path, None, None, "the root of all folders", expected)
+    try:
+        whole.with_name(f".{whole.name}.{os.getpid()}.unfinished.old").lstat()
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise TableError(path, None, None, error.strerror or str(error), expected) from None
 
 
 def is_parquet(file: Path) -> bool:
@@ -78,6 +87,7 @@ def write(directory: Path, texts: Mapping[str, str | bytes], read: Sequence[Path
 
 def check_file(path: Path, force: bool) -> None:
     """Raises TableError unless a single result may be written there."""
+    check_name(path, "a name for the file of the result")
     if path.is_dir():
         raise TableError(path, None, None, "a folder", "the name of a file for the result")
     if not force and path.exists():

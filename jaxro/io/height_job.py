@@ -30,13 +30,14 @@ class Options:
 
 
 def run(options: Options) -> bool:
-    """Read, calculate, write, show. True unless a traverse is suspicious. Raises TableError, with nothing written."""
+    """Read, calculate, show, write. True unless a traverse is suspicious. Raises TableError, with nothing written."""
     if options.out is not None:
         files.check_target(options.out, options.force)
     named = prepared(options)
     console, errors = consoles()
     done = finished(named)
     title = "the simulated plot" if options.file is None else str(options.file)
+    report.show(console, done, title)
     texts: dict[str, Any] = {}
     if options.out is not None:
         texts = contents(done)
@@ -45,8 +46,6 @@ def run(options: Options) -> bool:
         files.write(options.out, texts, (options.file, options.grid, options.traverses))
         if why:
             errors.print(f"Warning: no picture of the surface: {why}", style="yellow", markup=False)
-    report.show(console, done, title)
-    if options.out is not None:
         console.print(f"Written to {options.out}: {', '.join(texts)}", markup=False)
     if options.file is None:
         console.print(

@@ -134,7 +134,7 @@ def units_of(options: Options, has_sigma: bool, system: type[AbstractElements]) 
 
 
 def run(options: Options) -> bool:
-    """Read, orient, write, show. True if every pair is usable. Raises TableError, with nothing written."""
+    """Read, orient, show, write. True if every pair is usable. Raises TableError, with nothing written."""
     job = prepared(options)
     console, errors = consoles()
     warn(errors, job)
@@ -142,8 +142,8 @@ def run(options: Options) -> bool:
         oriented = orient_all(job, told)
     solved = solutions.solutions(job.table.pairs, job.cameras, oriented, job.units)
     texts = {} if options.out is None else files.texts(solved, job.units, job.summary(solved))
-    write(job, texts)
     show(console, job, solved)
+    write(job, texts)
     tell(console, job, texts)
     if options.file is None:
         console.print("This was the embedded example. Your own pairs: jaxro orient FILE.csv --focal F", markup=False)
@@ -211,7 +211,9 @@ def read_cameras(options: Options, otherwise: Example) -> camera_files.Cameras:
 
 
 def check_numbers(options: Options, has_sigma: bool, file: str, system: type[AbstractElements]) -> None:
-    """Raises TableError for a sigma or base that cannot be."""
+    """Raises TableError for a sigma, base or unit that cannot be."""
+    if not options.unit.strip() or any(mark in options.unit for mark in "[]\n"):
+        raise TableError("--unit", None, None, repr(options.unit), "a name such as mm or px, without brackets")
     if options.sigma is not None:
         if has_sigma:
             raise TableError("--sigma", None, None, f"it beside the column sigma of {file}", "only one of the two")

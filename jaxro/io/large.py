@@ -3,7 +3,7 @@
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from ..rejection import AbstractProcedure
 from . import files, job as jobs, parquet
 from .cameras import Cameras, check_one_sigma
 from .console import consoles, progress
+from .conversion import converted
 from .fields import TableError
 from .job import Options
 from .records import TABLES, Recorder
@@ -26,7 +27,7 @@ from .streaming import CONVERTED, JOURNAL, MODIFIED, PART_ROWS, Job, Work, here,
 from .tables import Measurements
 from .tolerances import check_sigma, tolerances
 
-REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
+REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL, CONVERTED)
 """What may be in a folder whose place the results take."""
 
 
@@ -51,9 +52,10 @@ def run(options: Options, large: Large, procedure: tuple[str, AbstractProcedure]
             tell(job.done)
             for entry in large.engine(job, tell):
                 job.finished(entry)
+        _check_place(job.target, options.force)  # what may have appeared there meanwhile
         summary = job.end()
     except (OSError, parquet.pa.ArrowException) as error:
-        raise _refused(job.work.file, job.work.folder, error) from None
+        raise _refused(job.work.file, job.work.folder, error, "; what is finished --resume keeps") from None
     show(console, job, summary, time.monotonic() - started)
     return good(summary)
 
@@ -74,25 +76,36 @@ def prepared(options: Options, large: Large, procedure: tuple[str, AbstractProce
     for name in chosen:
         if name not in TABLES:
             raise TableError("--tables", None, None, repr(name), f"some of {','.join(TABLES)}")
+    files.check_name(options.out, "a name for the folder of results")
     out = options.out.resolve()
     folder = out.with_name(f"{out.name}.unfinished")
     if large.resume and not folder.exists() and (out / JOURNAL).exists():
         os.replace(out, folder)  # stopped when only its journal was left to be removed
     _check(options, out, folder, large.resume)
+    stopped = None
+    if folder.exists() and not large.resume:  # kept until the table and all options are known to be good
+        stopped = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+        os.replace(folder, stopped)
     try:
         job = _planned(options, large, procedure, chosen, folder)
         job.go_on() if large.resume and job.begun else job.begin()
-    except (TableError, OSError, parquet.pa.ArrowException) as error:
+    except BaseException as error:
         if not large.resume:
             shutil.rmtree(folder, ignore_errors=True)
-        raise error if isinstance(error, TableError) else _refused(options.file, folder, error) from None
+        if stopped is not None:
+            os.replace(stopped, folder)
+        if isinstance(error, OSError | parquet.pa.ArrowException):
+            raise _refused(options.file, folder, error) from None
+        raise
+    if stopped is not None:
+        shutil.rmtree(stopped)
     return job
 
 
-def _refused(file: Path, folder: Path, error: Exception) -> TableError:
+def _refused(file: Path, folder: Path, error: BaseException, more: str = "") -> TableError:
     """What the disk or a damaged table said."""
     found = getattr(error, "strerror", None) or str(error).splitlines()[0]
-    expected = f"a table that can be read and a folder {folder} that can be written; what is finished --resume keeps"
+    expected = f"a table that can be read and a folder {folder} that can be written{more}"
     return TableError(file, None, None, found, expected)
 
 
@@ -109,7 +122,7 @@ def _planned(
         source = folder / CONVERTED
         if not (large.resume and source.exists() and (folder / JOURNAL).exists()):
             folder.mkdir(parents=True, exist_ok=True)
-            parquet.converted(options.file, source)
+            converted(options.file, source)
     table = parquet.Source(source, options.file)
     system = jobs.SYSTEMS[options.elements or "relative"]
     jobs.check_numbers(options, table.has_sigma, str(options.file), system)
@@ -154,20 +167,25 @@ def _check_cameras(cameras: Cameras, scan: parquet.Scan, file: Path, first: int,
 
 def _check(options: Options, out: Path, folder: Path, resume: bool) -> None:
     """Raises TableError unless the work may begin, or go on."""
-    force = options.force
-    files.check_target(out, force)
-    others = [entry.name for entry in out.iterdir() if entry.name not in REPLACED] if out.exists() else []
-    read = [file for file in (options.file, options.camera) if file is not None and out in file.resolve().parents]
-    if others or read:
-        found = f"{', '.join(sorted(others)[:5])}, no tables of an earlier run" if others else f"{read[0]}, to be read"
-        raise TableError(out, None, None, found, "another folder: Parquet results take the place of the whole folder")
+    read = [file.resolve() for file in (options.file, options.camera) if file is not None]
+    _check_place(out, options.force, read)
+    _check_place(folder, True, read)
     if resume and not folder.exists():
         raise TableError(folder, None, None, "no such folder", "the --out of a run that was stopped, to resume it")
-    if folder.exists() and not resume:
-        if not force:
-            expected = "--resume to go on, or --force to begin anew"
-            raise TableError(folder, None, None, "a run that was stopped", expected)
-        shutil.rmtree(folder)
+    if folder.exists() and not resume and not options.force:
+        expected = "--resume to go on, or --force to begin anew"
+        raise TableError(folder, None, None, "a run that was stopped", expected)
+
+
+def _check_place(folder: Path, force: bool, read: Sequence[Path] = ()) -> None:
+    """Raises TableError unless results may take the place of the whole folder, in which nothing else is or is read."""
+    files.check_target(folder, force)
+    ours = lambda name: name in REPLACED or name.endswith(".partial")
+    others = sorted(entry.name for entry in folder.iterdir() if not ours(entry.name)) if folder.exists() else []
+    inside = [file for file in read if folder in file.parents]
+    if others or inside:
+        found = f"{', '.join(others[:5])}, no tables of an earlier run" if others else f"{inside[0]}, to be read"
+        raise TableError(folder, None, None, found, "another --out: Parquet results take the place of the whole folder")
 
 
 def _request(options: Options, tables: tuple[str, ...], procedure: tuple[str, AbstractProcedure] | None) -> dict:

@@ -4,9 +4,7 @@ Columns are those of `tables`. The rows of a pair stand one behind the other. Na
 coordinate that is missing or not finite makes its pair `non_finite_input`, and harms no other.
 """
 
-import csv
-import os
-from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,16 +14,17 @@ from jaxtyping import Float, Int
 from ..pairs import Camera
 from ..ragged import Ragged
 from . import tables
-from .fields import TableError, read_text
+from .fields import TableError
 from .tables import COLUMNS
 
 try:
     import pyarrow as pa
     import pyarrow.compute as pc
-    import pyarrow.csv as arrow_csv
     import pyarrow.parquet as pq
 except ModuleNotFoundError:
     raise SystemExit("Parquet tables need pyarrow: pip install 'jaxro[cli,tables]'") from None
+
+NAMES = ("pair", "point")
 
 BATCH = 1 << 18
 """Rows decoded at once."""
@@ -48,7 +47,7 @@ class Source:
 
     def __init__(self, path: Path, told: Path | None = None):
         self.path = told or path  # as it is told of: a CSV table has been converted
-        self._first = 1 if self.path == path else 2  # the row, or the line, of the first point
+        self._converted = self.path != path
         try:
             self._file = pq.ParquetFile(path, pre_buffer=False)
         except (OSError, pa.ArrowInvalid) as error:
@@ -72,7 +71,7 @@ class Source:
         """Where the pairs begin: reads the column `pair` alone. Raises TableError where a pair comes in two parts."""
         if not self.count:
             raise TableError(self.path, None, None, "no points", "one row for every measured point")
-        for name in ("pair", "point"):
+        for name in NAMES:
             self._complete(name)
         if "pair" not in self.columns:
             return Scan(np.array([0, self.count]), pa.chunked_array([[self.path.stem]]))
@@ -94,15 +93,15 @@ class Source:
             return
         known, place = self._file.metadata, self._file.schema_arrow.get_field_index(self.columns[full])
         groups = [known.row_group(k).column(place).statistics for k in range(known.num_row_groups)]
-        if all(told is not None and told.has_null_count and told.null_count == 0 for told in groups):
+        if all(told is not None and told.null_count == 0 and _begins_with_a_letter(told) for told in groups):
             return
         row = 0
         for batch in self._file.iter_batches(BATCH, columns=[self.columns[full]]):
-            column = batch.column(0)
-            if column.null_count:
-                row += int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
+            blank = pc.equal(pc.utf8_trim_whitespace(batch.column(0).cast(pa.string())), "").fill_null(True)  # pyright: ignore[reportAttributeAccessIssue]
+            if pc.any(blank).as_py():  # pyright: ignore[reportAttributeAccessIssue]
+                row += int(np.flatnonzero(blank.to_numpy(zero_copy_only=False))[0])
                 raise TableError(self.path, None, full, f"nothing in {self._place(row)}", f"the name of the {full}")
-            row += len(column)
+            row += len(blank)
 
     def _once(self, names: Any, begins: np.ndarray) -> None:
         if len(names.unique()) == len(names):
@@ -117,7 +116,10 @@ class Source:
             seen.add(name)
 
     def _place(self, row: int) -> str:
-        return f"{'row' if self._first == 1 else 'line'} {row + self._first}"
+        if not self._converted:
+            return f"row {row + 1}"
+        line, *_ = next(islice(tables.lines(self.path), row, None))
+        return f"line {line}"
 
     def rows(self, begin: int, end: int) -> Any:
         """These rows as an Arrow table with the full names of the columns; one behind the other is read only once."""
@@ -149,12 +151,17 @@ class Source:
             skip -= min(skip, len(piece))
 
 
+def _begins_with_a_letter(told: Any) -> bool:
+    """Whether statistics of a column say that every value is a number or text that begins with no blank."""
+    return told.has_min_max and (not isinstance(told.min, str) or told.min[:1] > " ")
+
+
 def _columns(path: Path, schema: Any) -> dict[str, str]:
     """The columns in the table by their full names. Raises TableError for missing, unknown or unsuitable ones."""
     places = COLUMNS.places(schema.names, str(path), None)
     for full, place in places.items():
         field = schema.field(place)
-        named = full in ("pair", "point")
+        named = full in NAMES
         t = field.type.value_type if pa.types.is_dictionary(field.type) else field.type
         text = pa.types.is_string(t) or pa.types.is_large_string(t)
         good = text or pa.types.is_integer(t) if named else pa.types.is_floating(t) or pa.types.is_integer(t)
@@ -230,69 +237,6 @@ def _spread(cameras: Any, side: int, value: Any, begins: np.ndarray) -> Float[np
     if isinstance(cameras, tuple):
         return np.asarray(value(cameras[side]))
     return np.repeat(np.array([value(both[side]) for both in cameras], np.float64), np.diff(begins))
-
-
-def converted(source: Path, target: Path) -> None:
-    """A CSV table as a Parquet table, in bounded memory. Raises TableError with line and column."""
-    try:
-        with source.open(encoding="utf-8-sig", newline="") as file:
-            header = next(csv.reader(file), [])
-    except (OSError, UnicodeDecodeError, csv.Error):
-        header = []
-    if header:
-        COLUMNS.places(header, str(source), 1)
-    full = [COLUMNS.full(name) for name in header]
-    text = ("pair", "point")
-    draft = target.with_suffix(".partial")
-    try:
-        types = {c: pa.string() if c in text else pa.float64() for c in full}
-        reader = arrow_csv.open_csv(
-            source,
-            parse_options=arrow_csv.ParseOptions(invalid_row_handler=_blank) if header else None,
-            read_options=arrow_csv.ReadOptions(column_names=full, skip_rows=1, block_size=1 << 24),
-            convert_options=arrow_csv.ConvertOptions(column_types=types, null_values=[]),
-        )
-        writer = None
-        for batch in reader:
-            writer = writer or pq.ParquetWriter(draft, batch.schema, **encoding(batch.schema))
-            _check(batch)
-            for place, name in enumerate(batch.schema.names):
-                if name in text:
-                    batch = batch.set_column(place, name, pc.utf8_trim_whitespace(batch.column(place)))  # pyright: ignore[reportAttributeAccessIssue]
-            writer.write_batch(batch)
-        if writer is None:
-            raise pa.ArrowInvalid("no rows")
-        writer.close()
-        os.replace(draft, target)
-    except (pa.ArrowInvalid, pa.ArrowKeyError, OSError) as error:
-        draft.unlink(missing_ok=True)
-        for _ in _careful(source):  # says what is wrong where
-            pass
-        raise TableError(source, None, None, str(error).splitlines()[0], "a CSV table of measured points") from None
-
-
-def _blank(row: Any) -> str:
-    """Lines of blanks are no rows, as in `tables`."""
-    return "error" if row.text.strip() else "skip"
-
-
-def _check(batch: Any) -> None:
-    """Raises ArrowInvalid for what the careful reader would not take."""
-    for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        if name in ("pair", "point"):
-            if any(not text.strip() for text in column.unique().to_pylist()):
-                raise pa.ArrowInvalid(f"an empty field in column {name}")
-        elif not np.all(np.isfinite(values := column.to_numpy())) or (name == "sigma" and not np.all(values > 0)):
-            raise pa.ArrowInvalid(f"a number that cannot be used in column {name}")
-
-
-def _careful(path: Path) -> Iterator[tuple]:
-    """The lines of a CSV table as `tables` reads them, one at a time. Raises TableError."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            yield from tables.checked(file, str(path))
-    except (OSError, UnicodeDecodeError):
-        read_text(path)  # says which
 
 
 def write(table: Any, path: Path) -> None:

@@ -91,11 +91,10 @@ def run_comparison(options: Options, wanted: Wanted) -> bool:
             false_alarms=wanted.false_alarms,
             progress=told,
         )
-    if wanted.out is not None:
-        files.write_file(wanted.out, files.csv_text(rows(found)))
     for part in tables(found):
         console.print(part, markup=False)
     if wanted.out is not None:
+        files.write_file(wanted.out, files.csv_text(rows(found)))
         console.print(f"Written to {wanted.out}", markup=False)
     return True
 
@@ -132,6 +131,7 @@ def _standard(options: Options) -> tuple[str, Pair]:
         ("--principal-point", options.principal_point),
         ("--pixel-size", options.pixel_size),
         ("--y-down", options.y_down or None),
+        ("--unit", None if options.unit == "mm" else options.unit),
     ):
         if value is not None:
             raise TableError(name, None, None, "it without FILE.csv", "the table that it belongs to")

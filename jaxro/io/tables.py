@@ -85,8 +85,22 @@ def parse(text: str, file: str, name: str) -> Table:
         measured.rows.append(values)
         measured.lines.append(line)
     if not pairs:
-        raise TableError(file, line + 1, None, "no points", "one line for every measured point below the header")
+        raise no_points(file, line)
     return Table(file, list(pairs.values()), [_twins(file, pair, found) for pair, found in twins.items()])
+
+
+def no_points(file: str, line: int) -> TableError:
+    """There is nothing below this line."""
+    return TableError(file, line + 1, None, "no points", "one line for every measured point below the header")
+
+
+def lines(path: Path) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
+    """The `checked` lines of a file, one at a time. Raises TableError."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            yield from checked(file, str(path))
+    except (OSError, UnicodeDecodeError):
+        read_text(path)  # says which
 
 
 def checked(text: Iterable[str], file: str, name: str = "") -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
