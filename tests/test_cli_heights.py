@@ -233,7 +233,7 @@ def test_what_no_limit_was_found_for_is_not_told_as_one():
     assert "with this H:B of 4.0 even 20 times the camera height" in words(run(*plan, 8).stdout)
     assert "any base, even of 0.125 mm" in words(run(*plan, 1e9).stdout)
     told = words(run("plan", "--legs", 1).stdout)
-    assert "the middle of a traverse of 1 legs (13) - -" in told
+    assert "the middle of a traverse of 1 leg (13) - -" in told
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ QUANTITIES = {
     "height": "a height over the grid (1)",
     "difference": "the difference to a neighbour in the next square (5)",
     "in-square": "the difference to a neighbour in the same square (19)",
-    "middle": "the middle of a traverse of {legs} legs (13)",
-    "node": "a node of {traverses} traverses of {legs} legs (16)",
+    "middle": "the middle of a traverse of {legs} (13)",
+    "node": "a node of {traverses} of {legs} (16)",
     "detail": "a point read from the middle of a traverse (20)",
 }
 """What is asked for, in the order of `Expected`."""
@@ -67,7 +67,9 @@ def run(options: Options) -> bool:
 
 def named(options: Options) -> list[str]:
     """The quantities in words."""
-    return [what.format(legs=options.legs, traverses=options.traverses) for what in QUANTITIES.values()]
+    counted = lambda count, what: f"{count} {what}" if count == 1 else f"{count} {what}s"
+    legs, traverses = counted(options.legs, "leg"), counted(options.traverses, "traverse")
+    return [what.format(legs=legs, traverses=traverses) for what in QUANTITIES.values()]
 
 
 def planned(options: Options) -> tuple[Plan, Deviations]:
