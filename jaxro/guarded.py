@@ -4,7 +4,7 @@ What `where` selects away still meets its derivative backwards: 0 times an infin
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, ArrayLike, Bool
 
 
 def root(square: Array, there: Bool[Array, "..."] | bool = True) -> Array:
@@ -13,7 +13,7 @@ def root(square: Array, there: Bool[Array, "..."] | bool = True) -> Array:
     return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
 
 
-def times(values: Array, unit: Array) -> Array:
+def times(values: ArrayLike, unit: ArrayLike) -> Array:
     """The product, NaN where the unit is, as sigma0 is without redundancy; with finite derivatives by the values."""
     known = ~jnp.isnan(unit)
-    return jnp.where(known, values * jnp.where(known, unit, 0.0), jnp.nan)
+    return jnp.where(known, jnp.asarray(values) * jnp.where(known, unit, 0.0), jnp.nan)

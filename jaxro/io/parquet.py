@@ -88,12 +88,12 @@ class Source:
         return Scan(np.append(found, row), every)
 
     def _complete(self, full: str) -> None:
-        """Raises TableError for a row without a name; reads the column only where the file does not say."""
+        """Raises TableError for a row without a name; reads the column only where the file does not tell."""
         if full not in self.columns:
             return
         known, place = self._file.metadata, self._file.schema_arrow.get_field_index(self.columns[full])
         groups = [known.row_group(k).column(place).statistics for k in range(known.num_row_groups)]
-        if all(told is not None and told.null_count == 0 and _begins_with_a_letter(told) for told in groups):
+        if all(map(_named, groups)):
             return
         row = 0
         for batch in self._file.iter_batches(BATCH, columns=[self.columns[full]]):
@@ -151,9 +151,11 @@ class Source:
             skip -= min(skip, len(piece))
 
 
-def _begins_with_a_letter(told: Any) -> bool:
-    """Whether statistics of a column say that every value is a number or text that begins with no blank."""
-    return told.has_min_max and (not isinstance(told.min, str) or told.min[:1] > " ")
+def _named(told: Any) -> bool:
+    """Whether the statistics of a column say that no value is missing and no text begins with a blank."""
+    if told is None or not told.has_null_count or told.null_count or not told.has_min_max:
+        return False
+    return not isinstance(told.min, str) or told.min[:1] > " "
 
 
 def _columns(path: Path, schema: Any) -> dict[str, str]:
