@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .. import rotations as rot
-from ..adjustment import root
 from ..elements import AbstractElements, DependentElements, RelativePose
+from ..guarded import root
 from ..orientation import Orientation
 from ..pairs import Camera, Coordinates, Pair
 from ..programs import FAST, QUICK, Program
@@ -53,10 +53,12 @@ class Element:
 
 
 class Solved(NamedTuple):
-    """An orientation as it comes from the engine, the corrections of the coordinates, and its reliability if asked."""
+    """An orientation as it comes from the engine, the corrections of the coordinates, the numbers that are reported of
+    its elements, and its reliability if asked."""
 
     orientation: Orientation
     corrections: Coordinates
+    elements: tuple[list[Array], list[Array]]
     reading: Reliability | None
 
 
@@ -66,21 +68,23 @@ def read(orientation: Orientation, pair: Pair, reliable: bool, sigma_known: bool
     `reliable`: whether it is the minimum that reliability is defined for; `sigma_known`: whether pair.sigma are true
     standard deviations.
     """
-    reading = None
-    freedom = np.asarray(orientation.degrees_of_freedom)
-    if reliable and (sigma_known or np.max(freedom, initial=0) > 1):  # else nothing is testable
-        options = {"sigma0": jnp.ones(()) if sigma_known else None}
-        one = jnp.ndim(orientation.sigma0) == 0
-        reading = Program(_assessed if one else _all_assessed, options, QUICK if one else FAST)((pair, orientation))
-    return Solved(orientation, orientation.corrections(pair), reading)
+    testable = sigma_known or np.max(np.asarray(orientation.degrees_of_freedom), initial=0) > 1
+    options = {"reliable": reliable and bool(testable), "sigma0": jnp.ones(()) if sigma_known else None}
+    one = jnp.ndim(orientation.sigma0) == 0
+    # one program: the command line loads it in each of its calls
+    return Solved(
+        orientation, *Program(_told if one else _all_told, options, QUICK if one else FAST)((pair, orientation))
+    )
 
 
-def _assessed(read: tuple[Pair, Orientation], *, sigma0) -> Reliability:
-    return assess(*read, sigma0=sigma0)
+def _told(read: tuple[Pair, Orientation], *, reliable: bool, sigma0) -> tuple:
+    pair, o = read
+    elements = element_values(o.elements, o.cofactor, o.sigma0)
+    return o.corrections(pair), elements, assess(pair, o, sigma0=sigma0) if reliable else None
 
 
-def _all_assessed(read: tuple[Pair, Orientation], *, sigma0) -> Reliability:
-    return jax.vmap(lambda pair, orientation: assess(pair, orientation, sigma0=sigma0))(*read)
+def _all_told(read: tuple[Pair, Orientation], **options) -> tuple:
+    return jax.vmap(lambda *one: _told(one, **options))(*read)
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,7 @@ class Solution:
     @cached_property
     def result(self) -> str:
         """The name of the result."""
-        return NAMES[int(self.orientation.result._value)]
+        return _result(self.orientation)
 
     @cached_property
     def advice(self) -> str:
@@ -107,7 +111,7 @@ class Solution:
     @cached_property
     def usable(self) -> bool:
         """Whether the elements may be used."""
-        return self.result == "successful" or self.result in WARNED
+        return _usable(self.orientation)
 
     @cached_property
     def m_q(self) -> float:
@@ -142,6 +146,14 @@ class Solution:
             return {}
         names, values = type(self.orientation.elements).names, self.orientation.correlation
         return {f"{names[i]}/{names[j]}": float(values[i, j]) for i in range(5) for j in range(i + 1, 5)}
+
+
+def _result(orientation: Orientation) -> str:
+    return NAMES[int(orientation.result._value)]
+
+
+def _usable(orientation: Orientation) -> bool:
+    return _result(orientation) in ("successful", *WARNED)
 
 
 def element_values(found: AbstractElements, cofactor: Array, sigma0: Array) -> tuple[list[Array], list[Array]]:
@@ -185,21 +197,13 @@ def given(name: str, system: type[AbstractElements]) -> bool:
     return system is DependentElements and name == "bx"
 
 
-_all_values = jax.jit(jax.vmap(element_values))
-
-
-def shown_elements(orientations: list[Orientation], units: Units) -> list[list[Element]]:
-    """The elements of each orientation with their standard deviations."""
-    system = type(orientations[0].elements)
-    stacked = jax.tree.map(lambda *a: np.stack(a), *[(o.elements, o.cofactor, o.sigma0) for o in orientations])
-    values, deviations = _all_values(*stacked)
-    names = element_names(system)
+def shown_elements(found: Solved, units: Units) -> list[Element]:
+    """The elements of an orientation with their standard deviations, NaN where it is not usable."""
+    system = type(found.orientation.elements)
+    known = float if _usable(found.orientation) else lambda number: np.nan
     return [
-        [
-            Element(name, unit_of(name, units), value, None if given(name, system) else deviation)
-            for name, value, deviation in zip(names, row, spread, strict=True)
-        ]
-        for row, spread in zip(np.stack(values, 1).tolist(), np.stack(deviations, 1).tolist(), strict=True)
+        Element(name, unit_of(name, units), known(value), None if given(name, system) else known(deviation))
+        for name, value, deviation in zip(element_names(system), *found.elements, strict=True)
     ]
 
 
@@ -210,12 +214,7 @@ def solutions(
     units: Units,
 ) -> list[Solution]:
     """One `Solution` a pair, the elements of unusable ones NaN."""
-    out = []
-    shown = shown_elements([s.orientation for s in found], units)
-    for m, c, (o, v, r), elements in zip(measured, cameras, found, shown, strict=True):
-        solution = Solution(m, c, o, v, r, elements)
-        if not solution.usable:
-            blank = [Element(e.name, e.unit, np.nan, None if e.deviation is None else np.nan) for e in elements]
-            solution = Solution(m, c, o, v, r, blank)
-        out.append(solution)
-    return out
+    return [
+        Solution(m, c, s.orientation, s.corrections, s.reading, shown_elements(s, units))
+        for m, c, s in zip(measured, cameras, found, strict=True)
+    ]
