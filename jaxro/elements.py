@@ -30,7 +30,7 @@ Scalar = Float[Array, "..."]
 Step = tuple[Scalar, ...]
 """Five numbers"""
 
-NEVER = 1e-100
+TINY = 1e-100
 """What stands for a zero that would be divided by."""
 
 NOTHING = 1e-6
@@ -273,7 +273,7 @@ class DependentElements(AbstractElements):
     @classmethod
     def scale(cls, base: Vector, length: Scalar) -> Scalar:
         # an infinite scale would make the derivatives of a whole batch 0 * inf, though nobody uses it
-        return length / jnp.where(base[0] == 0, NEVER, base[0])
+        return length / jnp.where(base[0] == 0, TINY, base[0])
 
     @classmethod
     def exist(cls, base: Vector, length: Scalar) -> Bool[Array, "..."]:

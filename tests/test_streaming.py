@@ -270,6 +270,15 @@ def test_force_takes_the_place_of_no_folder_but_that_of_a_stopped_run(folder, tm
         assert list(tmp_path.rglob("*")) == [inside.parent, inside]
 
 
+def test_force_removes_nothing_that_only_looks_like_work(folder, tmp_path):
+    for name in ("input.parquet", "mine.partial"):
+        mine = tmp_path / name / name
+        mine.parent.mkdir()
+        mine.write_text("mine")
+        found = run("orient", folder / "table.parquet", "--focal", FOCAL, "--out", mine.parent, "--force")
+        assert found.exit_code == 2 and f"{name}, no tables" in found.output and mine.read_text() == "mine"
+
+
 def test_a_stopped_run_outlives_a_call_that_cannot_work(folder, whole, tmp_path):
     stopped = tmp_path / "out.unfinished"
     with pytest.raises(KeyboardInterrupt):

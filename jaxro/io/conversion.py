@@ -23,7 +23,7 @@ def converted(source: Path, target: Path) -> None:
     try:
         try:
             _quickly(source, draft)
-        except (pa.ArrowInvalid, pa.ArrowKeyError, OSError):
+        except (pa.ArrowInvalid, pa.ArrowKeyError):
             _carefully(source, draft)  # or says what is wrong where
         os.replace(draft, target)
     finally:

@@ -27,8 +27,11 @@ from .streaming import CONVERTED, JOURNAL, MODIFIED, PART_ROWS, Job, Work, here,
 from .tables import Measurements
 from .tolerances import check_sigma, tolerances
 
-REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL, CONVERTED)
+REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
 """What may be in a folder whose place the results take."""
+
+WORKED_ON = (*REPLACED, CONVERTED, *(str(Path(name).with_suffix(".partial")) for name in (JOURNAL, CONVERTED)))
+"""What may be in the folder of a run that was stopped."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +172,7 @@ def _check(options: Options, out: Path, folder: Path, resume: bool) -> None:
     """Raises TableError unless the work may begin, or go on."""
     read = [file.resolve() for file in (options.file, options.camera) if file is not None]
     _check_place(out, options.force, read)
-    _check_place(folder, True, read)
+    _check_place(folder, True, read, WORKED_ON)
     if resume and not folder.exists():
         raise TableError(folder, None, None, "no such folder", "the --out of a run that was stopped, to resume it")
     if folder.exists() and not resume and not options.force:
@@ -177,11 +180,10 @@ def _check(options: Options, out: Path, folder: Path, resume: bool) -> None:
         raise TableError(folder, None, None, "a run that was stopped", expected)
 
 
-def _check_place(folder: Path, force: bool, read: Sequence[Path] = ()) -> None:
+def _check_place(folder: Path, force: bool, read: Sequence[Path] = (), ours: Sequence[str] = REPLACED) -> None:
     """Raises TableError unless results may take the place of the whole folder, in which nothing else is or is read."""
     files.check_target(folder, force)
-    ours = lambda name: name in REPLACED or name.endswith(".partial")
-    others = sorted(entry.name for entry in folder.iterdir() if not ours(entry.name)) if folder.exists() else []
+    others = sorted(entry.name for entry in folder.iterdir() if entry.name not in ours) if folder.exists() else []
     inside = [file for file in read if folder in file.parents]
     if others or inside:
         found = f"{', '.join(others[:5])}, no tables of an earlier run" if others else f"{inside[0]}, to be read"
