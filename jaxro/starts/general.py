@@ -91,16 +91,15 @@ class General(AbstractStart):
 
     def _candidates(self, pair: Pair, judges: Pair) -> tuple[RelativePose, Bool[Array, " candidate"]]:
         """Poses, each with the base on whose side the judges see most points, and which of them are solutions."""
-        left, right = vectors(pair)
-        pick = _subsets(pair.mask, self.subsets)
+        seen = *vectors(judges), judges.mask
+        pick = _subsets(judges.mask, self.subsets)
         gather = lambda vectors: jnp.sum(pick[:, :, :, None] * vectors[None, None, :, :], axis=2)
-        essentials, real = jax.vmap(five_point)(gather(left), gather(right))
-        linear = eight_point(left, right, pair.mask.astype(left.dtype))
+        essentials, real = jax.vmap(five_point)(*map(gather, seen[:2]))
+        linear = eight_point(*vectors(pair), pair.mask.astype(pair.x_left.dtype))
         essentials = jnp.concatenate([essentials.reshape(-1, 3, 3), linear[None]])
         real = jnp.concatenate([real.reshape(-1), (pair.count >= 8)[None]])
         real = real & jnp.all(jnp.isfinite(essentials), axis=(1, 2))
         essentials = jnp.where(real[:, None, None], essentials, jnp.eye(3))
-        seen = *vectors(judges), judges.mask
         poses, _ = jax.vmap(lambda e: best_pose(e, *seen))(essentials)
         normal_case = jax.tree.map(lambda a: a[None], vertical(pair.focal_left))
         poses = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), poses, normal_case)
