@@ -30,7 +30,7 @@ CHUNK_POINTS = 16384
 SEARCHED = 16
 """Pairs per chunk at most where random subsets are tried."""
 
-ALONE = 1 << 14
+ALONE = 1 << 15
 """Points of a batch that are oriented from the vertical before other threads have begun."""
 
 MOMENT, SOON = 1 << 9, 1 << 17
@@ -124,8 +124,8 @@ def oriented_near(
 ) -> tuple[PyTree, np.ndarray]:
     """The same from the vertical, and for which pairs that fits; `options["start"]` is an `Auto`."""
     chunk = _chunk(pairs, way.chunk)
-    if pairs.x_left.size <= ALONE:
-        way = way._replace(threads=way.threads or 1, calls=0)
+    alone = pairs.x_left.size <= ALONE
+    way = way._replace(threads=way.threads or 1, calls=0) if alone else way._replace(calls=1)  # all take as long
     kernel = whole if options.get("solver") is None else None
     program = Program(_slab_near, options | {"chunk": chunk}, _settings(pairs, FAST | WIDE), kernel=kernel)
     return spread(pairs, program, way, chunk, report)

@@ -6,8 +6,10 @@ would wait for itself for ever.
 
 import math
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -57,15 +59,16 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
     leaves = jax.tree.leaves(data)
     total, points = leaves[0].shape[0], math.prod(leaves[0].shape[1:])
     devices = jax.local_devices()  # several GPUs take turns; a CPU is one, whose cores are the threads
-    cores = max(_cores(), 2 * len(devices))
-    workers = way.threads or cores
+    cores = _workers()
     if way.slab is not None:
         size = -(-way.slab // chunk) * chunk
     elif total <= chunk:
         size = min(1 << max(total - 1, 0).bit_length(), chunk)
     else:
         most = max(1, SLAB_POINTS // (chunk * max(points, 1)))
-        size = chunk * min(most, _rounded(-(-total // (max(way.calls * cores, 1) * chunk))))
+        calls = max(way.calls * cores, -(-total // (most * chunk)), 1)
+        calls = -(-calls // cores) * cores if calls > 1 else 1  # so that no core waits for the last call
+        size = chunk * min(most, _rounded(-(-total // (calls * chunk))))
     begins = range(0, total, size)
 
     def part(begin: int) -> PyTree:
@@ -93,17 +96,48 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
         return end - begin
 
     work = lambda begin: store(begin, part(begin) if first is None or begin else first)
-    done = 0
-    if len(begins) == 1 or workers == 1:
-        for begin in begins:
-            done += work(begin)
-            report(done, total)
-        return out
-    with ThreadPoolExecutor(workers) as pool:
-        for future in as_completed([pool.submit(work, begin) for begin in begins]):
-            done += future.result()
-            report(done, total)
+    _shared(work, begins, min(way.threads or cores, len(begins)) - 1, lambda done: report(done, total))
+    report(total, total)
     return out
+
+
+def _shared(work: Callable[[int], int], begins: Iterable[int], helpers: int, heard: Callable[[int], None]) -> None:
+    """work(begin) of every slab by the calling thread and `helpers` others, each taking the next when it is free; what
+    is done is `heard` in the calling thread. After an error or an interrupt nobody begins another."""
+    left, done = deque(begins), []
+
+    def go(heard: Callable[[int], None]) -> None:
+        try:
+            while True:
+                try:
+                    begin = left.popleft()
+                except IndexError:
+                    return
+                done.append(work(begin))
+                if left:
+                    heard(sum(done))
+        finally:
+            left.clear()
+
+    others = [_pool().submit(go, lambda done: None) for _ in range(helpers)]
+    try:
+        go(heard)
+    finally:
+        others = [other for other in others if not other.cancel()]  # who has not begun by now has nothing to do
+        wait(others)
+    for other in others:
+        other.result()
+
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    """Threads that help; they wait for the next call, since to begin one takes as long as a hundred pairs."""
+    return ThreadPoolExecutor(_workers(), "jaxro")
+
+
+def _workers() -> int:
+    """Threads that keep every core and every device busy."""
+    return max(_cores(), 2 * jax.local_device_count())
 
 
 def chunked(one: Callable, data: PyTree, chunk: int) -> PyTree:

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -14,7 +15,7 @@ import problems
 import pytest
 
 import jaxro
-from jaxro import DependentElements, batch, program_store, simulation, starts
+from jaxro import DependentElements, batch, program_store, simulation, slabs, starts
 from jaxro.elements import vertical
 from jaxro.memory import LARGE, Memory
 from jaxro.programs import FAST, Program, whole
@@ -200,6 +201,45 @@ def test_batches_from_two_threads_at_once(pairs):
         results = list(pool.map(lambda _: jaxro.orient_batch(pairs).pose.base, range(8)))
     for base in results:
         np.testing.assert_array_equal(base, expected)
+
+
+class Doubled(Program):
+    """Stands for a compiled program; fails at what begins with `bad`."""
+
+    outputs = None
+
+    def __init__(self, bad=None):
+        self.bad, self.outputs, self.began = bad, {}, []
+
+    def __call__(self, data):
+        self.began.append(int(data[0]))
+        time.sleep(1e-4)  # lets the others have their turn, as a program does
+        if data[0] == self.bad:
+            raise OSError("no more")
+        return 2 * data
+
+
+def test_slabs_are_shared_and_an_end_is_one_for_all():
+    """Every slab once by whoever is free; after an error in any thread, or in the report of progress, nobody begins
+    another."""
+    data = np.arange(1000)
+    for threads in (1, 2, 5):
+        run = Doubled()
+        np.testing.assert_array_equal(slabs.spread(data, run, slabs.Way(threads, slab=1), 1), 2 * data)
+        assert sorted(run.began) == data.tolist()
+        for bad in (0, 1, 2, 10):
+            run = Doubled(bad)
+            with pytest.raises(OSError, match="no more"):
+                slabs.spread(data, run, slabs.Way(threads, slab=1), 1)
+            assert len(run.began) < 100
+        run = Doubled()
+        with pytest.raises(KeyboardInterrupt):
+            slabs.spread(data, run, slabs.Way(threads, slab=1), 1, _interrupted)
+        assert len(run.began) < 100
+
+
+def _interrupted(done, total):
+    raise KeyboardInterrupt
 
 
 def _model(orientation):
