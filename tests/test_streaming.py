@@ -320,10 +320,10 @@ def test_what_judges_by_sigma_is_not_run_without_one(folder):
 def test_cameras_that_do_not_fit_are_told_before_anything_is_done(folder, tmp_path):
     """By the table and the line that the user knows, and nothing is left that had to be resumed."""
     (tmp_path / "camera.toml").write_text("[photo.1]\nfocal = 100\n[photo.2]\nfocal = 100\n")
-    for table, line in (("table.csv", 2), ("table.parquet", 1)):
+    for table, place in (("table.csv", "line 2"), ("table.parquet", "row 1")):
         out = tmp_path / "out"
         found = run("orient", folder / table, "--camera", tmp_path / "camera.toml", "--parquet", "--out", out)
-        assert found.exit_code == 2 and f"{table}, line {line}, column pair: found 'p000'" in found.output
+        assert found.exit_code == 2 and f"{table}, {place}, column pair: found 'p000'" in found.output
     (tmp_path / "camera.toml").write_text("[left]\nfocal = 100\n[right]\nfocal = 100\npixel_size = 2\n")
     options = ("--camera", tmp_path / "camera.toml", "--sigma", 0.01)
     found = run("orient", folder / "table.parquet", *options, "--out", tmp_path / "out")

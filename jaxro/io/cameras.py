@@ -34,17 +34,17 @@ class Cameras:
     right: Camera | None = None
     photos: dict[str, Camera] = field(default_factory=dict)
 
-    def of(self, measured: Measurements, file: str) -> tuple[Camera, Camera]:
-        """(left, right) of one pair. Raises TableError if its name does not say which photos it is made of."""
+    def of(self, name: str, file: str, line: int | str | None = None) -> tuple[Camera, Camera]:
+        """(left, right) of the pair of this name, that begins at a line of the file. Raises TableError if the name does
+        not say which photos it is made of."""
         if self.left is not None and self.right is not None:
             return self.left, self.right
-        name = measured.name
         splits = [(name[:i], name[i + 1 :]) for i, letter in enumerate(name) if letter in "-_"]
         known = [split for split in splits if all(photo in self.photos for photo in split)]
         if len(known) != 1:
             found = f"{name!r}" if not known else f"{name!r}, which can be split in {len(known)} ways"
             expected = f"LEFT-RIGHT or LEFT_RIGHT with two photos of {self.file}: {', '.join(self.photos)}"
-            raise TableError(file, measured.lines[0], "pair", found, expected)
+            raise TableError(file, line, "pair", found, expected)
         return self.photos[known[0][0]], self.photos[known[0][1]]
 
 
@@ -117,7 +117,7 @@ def _line(text: str, table: str, key: str | None = None) -> int | None:
     return None
 
 
-def check_one_sigma(file: str, line: int | None, left: Camera, right: Camera) -> None:
+def check_one_sigma(file: str, line: int | str | None, left: Camera, right: Camera) -> None:
     """Raises TableError where one sigma cannot serve two pixel sizes."""
     if left.pixel_size != right.pixel_size:
         found = f"sigma with pixel sizes {left.pixel_size!r} (left) and {right.pixel_size!r} (right)"

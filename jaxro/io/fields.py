@@ -9,13 +9,14 @@ from pathlib import Path
 
 
 class TableError(ValueError):
-    """Input that cannot be used: where it is, what was found there, what was expected."""
+    """Input that cannot be used: where it is (`line`: its number, or "row 5"), what was found there, what was
+    expected."""
 
-    def __init__(self, file: str | Path, line: int | None, column: str | None, found: str, expected: str):
+    def __init__(self, file: str | Path, line: int | str | None, column: str | None, found: str, expected: str):
         self.file, self.line, self.column, self.found, self.expected = str(file), line, column, found, expected
         place = [self.file]
         if line is not None:
-            place.append(f"line {line}")
+            place.append(line if isinstance(line, str) else f"line {line}")
         if column is not None:
             place.append(f"column {column}")
         super().__init__(f"{', '.join(place)}: found {found}; expected {expected}")

@@ -115,7 +115,7 @@ def prepared(options: Options, otherwise: Example = MEASURED) -> Job:
     system = SYSTEMS[options.elements or ("relative" if options.file else "dependent")]
     table = read_table(options, otherwise)
     known = read_cameras(options, otherwise)
-    cameras = [known.of(measured, table.file) for measured in table.pairs]
+    cameras = [known.of(measured.name, table.file, measured.lines[0]) for measured in table.pairs]
     check_numbers(options, table.has_sigma, table.file, system)
     pairs = [
         camera_files.to_pair(measured, table.file, *both, options.sigma)

@@ -24,7 +24,6 @@ from .records import TABLES, Recorder
 from .report import table as terminal_table
 from .solutions import WARNED
 from .streaming import CONVERTED, JOURNAL, MODIFIED, PART_ROWS, Job, Work, here, parts
-from .tables import Measurements
 from .tolerances import check_sigma, tolerances
 
 REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
@@ -134,7 +133,7 @@ def _planned(
         check_sigma(*procedure, known)
     scan = table.scan()
     cameras = jobs.read_cameras(options, jobs.MEASURED)
-    _check_cameras(cameras, scan, options.file, 1 if source == options.file else 2, known)
+    _check_cameras(cameras, scan, table, known)
     pieces = parts(scan.begins, large.part_rows)
     keywords = {"elements": system, "base": options.base, "residual": jobs.RESIDUALS[options.residual]}
     order = tuple(name for name in TABLES if name in ("elements", *chosen))
@@ -155,17 +154,17 @@ def _planned(
     return Job(work, pieces, options.out.resolve(), _request(options, order, procedure))
 
 
-def _check_cameras(cameras: Cameras, scan: parquet.Scan, file: Path, first: int, sigma: bool) -> None:
-    """Raises TableError for a pair without cameras, or with two that one sigma cannot serve.
-
-    `first`: the line or row of the first point.
-    """
+def _check_cameras(cameras: Cameras, scan: parquet.Scan, table: parquet.Source, sigma: bool) -> None:
+    """Raises TableError for a pair without cameras, or with two that one sigma cannot serve."""
     one_for_all = cameras.left is not None and cameras.right is not None
     names = scan.names.slice(0, 1).to_pylist() if one_for_all else scan.names.to_pylist()
     for name, row in zip(names, scan.begins[:-1].tolist(), strict=False):
-        both = cameras.of(Measurements(str(name), lines=[row + first]), str(file))
-        if sigma:
-            check_one_sigma(str(file), row + first, *both)
+        try:
+            both = cameras.of(str(name), str(table.path))
+            if sigma:
+                check_one_sigma(str(table.path), None, *both)
+        except TableError as error:
+            raise TableError(error.file, table.place(row), error.column, error.found, error.expected) from None
 
 
 def _check(options: Options, out: Path, folder: Path, resume: bool) -> None:

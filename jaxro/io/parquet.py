@@ -100,7 +100,7 @@ class Source:
             blank = pc.equal(pc.utf8_trim_whitespace(batch.column(0).cast(pa.string())), "").fill_null(True)  # pyright: ignore[reportAttributeAccessIssue]
             if pc.any(blank).as_py():  # pyright: ignore[reportAttributeAccessIssue]
                 row += int(np.flatnonzero(blank.to_numpy(zero_copy_only=False))[0])
-                raise TableError(self.path, None, full, f"nothing in {self._place(row)}", f"the name of the {full}")
+                raise TableError(self.path, None, full, f"nothing in {self.place(row)}", f"the name of the {full}")
             row += len(blank)
 
     def _once(self, names: Any, begins: np.ndarray) -> None:
@@ -109,13 +109,14 @@ class Source:
         seen: set = set()
         for name, row in zip(names.to_pylist(), begins, strict=True):
             if name in seen:
-                found = f"pair {name!r} again in {self._place(int(row))}, after other pairs"
+                found = f"pair {name!r} again in {self.place(int(row))}, after other pairs"
                 raise TableError(
                     self.path, None, "pair", found, "the rows of a pair one behind the other: sort the table"
                 )
             seen.add(name)
 
-    def _place(self, row: int) -> str:
+    def place(self, row: int) -> str:
+        """How a row is told of: by its line where the table has been converted."""
         if not self._converted:
             return f"row {row + 1}"
         line, *_ = next(islice(tables.lines(self.path), row, None))

@@ -31,7 +31,6 @@ from .fields import TableError
 from .files import json_text
 from .records import Recorder
 from .solutions import NAMES, Units
-from .tables import Measurements
 from .verdicts import NAMES as OUTCOMES, decision, unusable
 
 PART_ROWS = 1 << 19
@@ -119,7 +118,7 @@ class Worker:
         known = self._work.cameras
         if known.left is not None and known.right is not None:
             return known.left, known.right
-        return [known.of(Measurements(str(name)), str(self._work.file)) for name in names.to_pylist()]
+        return [known.of(str(name), str(self._work.file)) for name in names.to_pylist()]
 
     def _elements(
         self, points: np.ndarray, names: Any, of_pair: dict[str, np.ndarray], outcomes: np.ndarray | None
