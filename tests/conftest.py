@@ -28,16 +28,10 @@ import jax  # noqa: E402
 
 from jaxro import programs  # noqa: E402  (64 bit)
 
+gc.disable()  # what JAX keeps of the programs would be looked through at every collection: a sixteenth of the time
 programs.QUICK.update(programs.QUICKEST)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def kept():
-    """What JAX keeps of the programs of a module is not looked through again at every collection."""
-    yield
-    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -251,15 +251,21 @@ SOLVERS = {
 }
 
 
-@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
-def test_solvers_of_optimistix_agree(solver):
+@pytest.mark.parametrize(
+    ("solver", "system"),
+    [
+        pytest.param(solver, system, marks=[] if i == j else pytest.mark.slow, id=f"{name}-{system.__name__}")
+        for i, (name, solver) in enumerate(SOLVERS.items())
+        for j, system in enumerate(problems.SYSTEMS)
+    ],
+)
+def test_solvers_of_optimistix_agree(solver, system):
     """To 1e-9, angles in rad and the base in units of bx."""
     measured = problems.tilted()
-    for system in problems.SYSTEMS:
-        one, two = (oriented(measured, system, base=1.0, **k) for k in ({}, {"solver": solver, "max_steps": 200}))
-        two.check()
-        np.testing.assert_allclose(numbers(two.elements), numbers(one.elements), rtol=0, atol=1e-9)
-        np.testing.assert_allclose(two.sigma0, one.sigma0, rtol=1e-9)
+    one, two = (oriented(measured, system, base=1.0, **k) for k in ({}, {"solver": solver, "max_steps": 200}))
+    two.check()
+    np.testing.assert_allclose(numbers(two.elements), numbers(one.elements), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(two.sigma0, one.sigma0, rtol=1e-9)
 
 
 def spoiled(measured):
@@ -279,7 +285,11 @@ def spoiled(measured):
     ]
 
 
-@every_system
+@pytest.mark.parametrize(
+    "system",
+    [RelativePose, DependentElements, pytest.param(IndependentElements, marks=pytest.mark.slow)],
+    ids=lambda s: s.__name__,
+)
 def test_failures_leave_their_neighbours_alone(system):
     """Bit for bit: in a batch, good pairs come out the same whatever the others are."""
     good = [problems.tilted(seed=seed) for seed in range(14)]
