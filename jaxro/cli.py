@@ -306,10 +306,13 @@ def _engine(name: Engine) -> Callable:
 def _end(work: Callable[[], bool]) -> None:
     """Do the work with compiled programs kept; the exit code says how it ended."""
     from . import program_store
+    from .io.console import aborted
 
     program_store.use(program_store.default_folder())
     try:
         good = work()
+    except KeyboardInterrupt:
+        aborted()
     except TableError as error:
         typer.secho(f"Error: {error}", err=True, fg="red")
         raise typer.Exit(2) from None

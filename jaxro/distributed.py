@@ -51,7 +51,8 @@ def on_ray(job: Job, told: Callable[[int], None]) -> Iterator[dict[str, Any]]:
         raise SystemExit("A cluster needs Ray: pip install 'jaxro[cluster]'") from None
     if not job.left:
         return
-    if not ray.is_initialized():
+    own = not ray.is_initialized()
+    if own:
         address = os.environ.get("RAY_ADDRESS")
         _check_address(address)
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
@@ -73,6 +74,10 @@ def on_ray(job: Job, told: Callable[[int], None]) -> Iterator[dict[str, Any]]:
             done += entry["pairs"]
             told(done)
             yield entry
+    except KeyboardInterrupt:
+        if own:
+            ray.shutdown()
+        raise
     except RayError as error:
         found = str(error).strip().splitlines()[-1]
         expected = f"a table and a folder {job.work.folder} on a file system that all machines share"

@@ -240,8 +240,11 @@ def _batches(
 def _overlapping(work: Callable, batches: Sequence[tuple]) -> Iterator[tuple]:
     """work(*batch) of every batch, two at a time: one is padded, or put in order by the caller, while another is
     calculated. The longest first, so that both end together."""
-    with ThreadPoolExecutor(2) as pool:
+    pool = ThreadPoolExecutor(2)
+    try:
         yield from pool.map(lambda batch: work(*batch), reversed(batches))
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)  # who interrupts does not wait for a program to be compiled
 
 
 class _Out:

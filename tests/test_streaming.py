@@ -129,6 +129,33 @@ def stopped(folder: Path, out: Path, parts: int) -> None:
     process.wait()
 
 
+INTERRUPTED = """
+import signal, sys
+from jaxro.cli import app
+signal.signal(signal.SIGINT, signal.default_int_handler)  # one that runs in the background may ignore it
+app(["orient", sys.argv[1], "--focal", "100", "--out", sys.argv[2]], prog_name="jaxro")
+"""
+
+
+def test_an_interrupt_ends_at_once_and_what_was_done_is_kept(folder):
+    """While programs are compiled, too, of which XLA then goes on reading the text."""
+    out, unfinished = folder / "interrupted", folder / "interrupted.unfinished"
+    leave = ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")  # compiles as long as with users
+    environment = {name: value for name, value in os.environ.items() if name not in leave}
+    command = [sys.executable, "-c", INTERRUPTED, folder / "table.parquet", out]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 120
+    while not (unfinished / JOURNAL).exists():
+        assert process.poll() is None and time.monotonic() < until
+        time.sleep(0.01)
+    time.sleep(3)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "0 of 1 parts are finished; --resume goes on" in told and told.endswith("Aborted.\n")
+    assert not out.exists() and unfinished.exists()
+
+
 def test_a_killed_run_is_resumed_to_the_same_bytes(folder, whole):
     out = folder / "killed"
     stopped(folder, out, 3)

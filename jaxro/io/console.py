@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 from rich.console import Console
 
@@ -13,6 +14,17 @@ def consoles() -> tuple[Console, Console]:
     # text that goes to a file or a pipe is not wrapped at 80 columns
     wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200
     return Console(width=wide, highlight=False, emoji=False), Console(stderr=True, highlight=False, emoji=False)
+
+
+def aborted() -> NoReturn:
+    """The end of a process after Ctrl-C, while the exception still holds what its calls hold.
+
+    Of a program that it compiles JAX frees the text with the interrupted call, but XLA goes on in a thread of its own
+    and reads it: the process died of a segmentation fault.
+    """
+    sys.stdout.flush()
+    print("Aborted.", file=sys.stderr, flush=True)
+    os._exit(130)
 
 
 @contextmanager

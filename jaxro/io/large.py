@@ -58,6 +58,9 @@ def run(options: Options, large: Large, procedure: tuple[str, AbstractProcedure]
         summary = job.end()
     except (OSError, parquet.pa.ArrowException) as error:
         raise _refused(job.work.file, job.work.folder, error, "; what is finished --resume keeps") from None
+    except KeyboardInterrupt:
+        errors.print(f"{len(job.entries)} of {len(job.parts)} parts are finished; --resume goes on", markup=False)
+        raise
     show(console, job, summary, time.monotonic() - started)
     return good(summary)
 
