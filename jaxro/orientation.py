@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from inspect import signature
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,7 +21,7 @@ from .losses import AbstractLoss
 from .model_points import model_points
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned, double
-from .programs import FAST, QUICK, QUICKEST, Program, loops, traced
+from .programs import FAST, QUICK, QUICKEST, Program, loops, traced, whole
 from .reductions import count, total
 from .results import RESULTS, is_usable
 
@@ -122,14 +123,17 @@ def orient(
     options = dict(elements=elements, base=base, residual=residual, loss=loss, solver=solver, max_steps=max_steps)
     if traced((pair, base, start)):
         return _orient(pair, start=start, **options)
-    kernel = loops if solver is None and pair.x_left.size else None  # the compiler does not survive one of no points
     settings = QUICKEST if pair.x_left.size <= FEW else QUICK
-    run = lambda function, start: Program(function, options | {"start": start}, settings, kernel=kernel)(pair)
+
+    def run(function: Callable, start: Any, kernel: Callable) -> Any:
+        small = kernel if solver is None and pair.x_left.size else None  # the compiler does not survive no points
+        return Program(function, options | {"start": start}, settings, kernel=small)(pair)
+
     if not isinstance(start, starts.Auto):
-        return run(_orient, start)
+        return run(_orient, start, loops)
     # two small programs instead of one large: the general start is compiled when a pair first needs it
-    orientation, fits = run(orient_near, start)
-    return orientation if bool(fits) else run(_orient, start.general)
+    orientation, fits = run(orient_near, start, whole)
+    return orientation if bool(fits) else run(_orient, start.general, loops)
 
 
 DEFAULTS = {

@@ -32,7 +32,8 @@ WIDE = {"xla_cpu_prefer_vector_width": 512}
 """Vectors of eight numbers where the processor has them."""
 
 QUICK = {**FAST, "xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
-"""For single pairs: the older code generator at a lower level compiles in half the time, and runs no slower there."""
+"""For single pairs: the older code generator, which jaxlib has up to 0.11.0, and a lower level compile in half the
+time, and what they make runs no slower there."""
 
 QUICKEST = {**QUICK, "xla_backend_optimization_level": 0}
 """For what is done once: compiles in another fifth less of the time, and a single pair of few points takes a tenth
@@ -151,12 +152,16 @@ def _beside(function: Callable, static: _Key, settings: tuple) -> dict[str, Any]
 
 @lru_cache
 def _known(settings: tuple) -> dict[str, Any] | None:
-    """The settings if this compiler has them all (their names are its own and may go), else none."""
-    try:
-        jax.jit(lambda: 0, compiler_options=dict(settings)).lower().compile()
-    except jax.errors.JaxRuntimeError:
-        return None
-    return dict(settings)
+    """Those of the settings that this compiler has, none if it is none: their names are its own, and come and go."""
+
+    def has(*some: tuple[str, Any]) -> bool:
+        try:
+            jax.jit(lambda: 0, compiler_options=dict(some)).lower().compile()
+        except jax.errors.JaxRuntimeError:
+            return False
+        return True
+
+    return dict(settings if has(*settings) else filter(has, settings)) or None
 
 
 def stage(function: Callable) -> Callable:

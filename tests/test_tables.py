@@ -118,18 +118,18 @@ def test_a_point_under_two_names_is_a_warning():
 
 
 def test_cameras_of_every_form(tmp_path):
-    pair = tables.Measurements("in-strip_1_10", ["a"], [(1.0, 2.0, 3.0, 4.0)], [2])
+    name = "in-strip_1_10"
     forms = {
         "[camera]\nfocal = 3": (3, 3),
         "[left]\nfocal = 3\n[right]\nfocal = 4": (3, 4),
         "[photo.10]\nfocal = 4\n[photo.in-strip_1]\nfocal = 3\n[photo.in]\nfocal = 5": (3, 4),
     }
     for text, focals in forms.items():
-        both = cameras.read(write(tmp_path, text, "camera.toml")).of(pair, "pairs.csv")
+        both = cameras.read(write(tmp_path, text, "camera.toml")).of(name, "pairs.csv")
         assert tuple(camera.focal for camera in both) == focals
     photos = cameras.read(write(tmp_path, "[photo.1]\nfocal = 3\n[photo.2]\nfocal = 4", "camera.toml"))
     with pytest.raises(TableError, match=r"line 2, column pair.*LEFT-RIGHT") as caught:
-        photos.of(pair, "pairs.csv")
+        photos.of(name, "pairs.csv", 2)
     assert "1, 2" in caught.value.expected
 
 
