@@ -7,6 +7,7 @@ that belongs to somebody else, is not used.
 """
 
 import hashlib
+import io
 import os
 import pickle
 import platform
@@ -62,7 +63,7 @@ def compiled(function: Callable, settings: dict[str, Any] | None, data: PyTree, 
     leaves, structure = jax.tree.flatten(data)
     shapes = [(a.shape, str(a.dtype)) for a in map(jax.typeof, leaves)]
     try:
-        content = pickle.dumps((_surroundings(), settings, shapes, str(structure), key))
+        content = _in_full((_surroundings(), settings, shapes, str(structure), key))
     except (pickle.PicklingError, AttributeError, TypeError):  # a lambda among the options has no name to be found by
         program = jax.jit(function, compiler_options=settings)
         return lambda data: program(*data)
@@ -87,6 +88,16 @@ def compiled(function: Callable, settings: dict[str, Any] | None, data: PyTree, 
         program, like = stored
     out_structure = jax.tree.structure(like)
     return lambda data: jax.tree.unflatten(out_structure, program(*jax.tree.leaves(data)))
+
+
+def _in_full(value: Any) -> bytes:
+    """The pickle of a value without references to objects that occur in it before, so that equal values have equal ones
+    whichever objects they are made of."""
+    file = io.BytesIO()
+    pickler = pickle.Pickler(file)
+    pickler.fast = True
+    pickler.dump(value)
+    return file.getvalue()
 
 
 def _read(path: Path) -> tuple[Callable, PyTree] | None:

@@ -80,7 +80,7 @@ class Program:
 
     def __call__(self, data: PyTree) -> PyTree:
         settings = *self._settings, *ONE_KERNEL.items()
-        if self._kernel is not None and not self.refused and _settings(settings):
+        if self._kernel is not None and not self.refused and known(dict(settings)):
             try:
                 return self._run(data, self._kernel(self._function), settings)
             except jax.errors.JaxRuntimeError:  # sorting, say, in what a caller selects
@@ -104,7 +104,7 @@ class Program:
             stored = _beside(*key).setdefault("stored", {})
             if shapes not in stored:
                 flat = _flat(function, self._static)
-                stored[shapes] = program_store.compiled(flat, _settings(settings), arguments, key)
+                stored[shapes] = program_store.compiled(flat, known(dict(settings)), arguments, key)
             return stored[shapes](arguments)
         return _compiled(function, *key[1:])(*arguments)
 
@@ -135,13 +135,14 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
-def _settings(settings: tuple) -> dict[str, Any] | None:
-    return _known(settings) if jax.default_backend() == "cpu" else None
+def known(settings: dict[str, Any]) -> dict[str, Any] | None:
+    """Those of the settings that the compiler has, as `jax.jit` takes them: names are its own, and come and go."""
+    return _known(tuple(settings.items())) if jax.default_backend() == "cpu" else None
 
 
 @lru_cache(maxsize=64)
 def _compiled(function: Callable, static: _Key, settings: tuple) -> Callable:
-    return jax.jit(_flat(function, static), compiler_options=_settings(settings))
+    return jax.jit(_flat(function, static), compiler_options=known(dict(settings)))
 
 
 @lru_cache(maxsize=64)
@@ -152,8 +153,6 @@ def _beside(function: Callable, static: _Key, settings: tuple) -> dict[str, Any]
 
 @lru_cache
 def _known(settings: tuple) -> dict[str, Any] | None:
-    """Those of the settings that this compiler has, none if it is none: their names are its own, and come and go."""
-
     def has(*some: tuple[str, Any]) -> bool:
         try:
             jax.jit(lambda: 0, compiler_options=dict(some)).lower().compile()

@@ -12,12 +12,12 @@ import oracles
 import jaxro
 from jaxro import DependentElements, IndependentElements, Pair, RelativePose, pair, simulation
 from jaxro.experiments import dorozhinsky1971
-from jaxro.programs import QUICK
+from jaxro.programs import QUICK, known
 
 orient = jaxro.orient
 """Compiled once per element system, residual and shape for the whole run of tests."""
 
-jit = partial(jax.jit, compiler_options=QUICK)
+jit = partial(jax.jit, compiler_options=known(QUICK))
 """For large programs that run once."""
 
 SYSTEMS = (RelativePose, IndependentElements, DependentElements)

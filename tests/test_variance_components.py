@@ -9,7 +9,7 @@ import oracles
 import pytest
 
 from jaxro import IndependentElements, orient, pad, simulation, variance_components as components
-from jaxro.programs import QUICK
+from jaxro.programs import QUICK, known
 
 optimize = pytest.importorskip("scipy.optimize")
 
@@ -30,7 +30,7 @@ def program():
         measured = simulation.planted(clean, **dict(zip(names, errors, strict=True)))
         return measured, orient(measured, elements=IndependentElements, base=BASE, start=true)
 
-    return jax.jit(jax.vmap(one, in_axes=(None, None, 0, None)), compiler_options=QUICK)
+    return jax.jit(jax.vmap(one, in_axes=(None, None, 0, None)), compiler_options=known(QUICK))
 
 
 def batch(elements, sigma, count, seed=0):
