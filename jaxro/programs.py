@@ -80,7 +80,7 @@ class Program:
 
     def __call__(self, data: PyTree) -> PyTree:
         settings = *self._settings, *ONE_KERNEL.items()
-        if self._kernel is not None and not self.refused and known(dict(settings)):
+        if self._kernel is not None and not self.refused and _known(settings):
             try:
                 return self._run(data, self._kernel(self._function), settings)
             except jax.errors.JaxRuntimeError:  # sorting, say, in what a caller selects
@@ -104,7 +104,7 @@ class Program:
             stored = _beside(*key).setdefault("stored", {})
             if shapes not in stored:
                 flat = _flat(function, self._static)
-                stored[shapes] = program_store.compiled(flat, known(dict(settings)), arguments, key)
+                stored[shapes] = program_store.compiled(flat, _known(settings), arguments, key)
             return stored[shapes](arguments)
         return _compiled(function, *key[1:])(*arguments)
 
@@ -137,12 +137,12 @@ def uncollected() -> Iterator[None]:
 
 def known(settings: dict[str, Any]) -> dict[str, Any] | None:
     """Those of the settings that the compiler has, as `jax.jit` takes them: names are its own, and come and go."""
-    return _known(tuple(settings.items())) if jax.default_backend() == "cpu" else None
+    return _known(tuple(settings.items()))
 
 
 @lru_cache(maxsize=64)
 def _compiled(function: Callable, static: _Key, settings: tuple) -> Callable:
-    return jax.jit(_flat(function, static), compiler_options=known(dict(settings)))
+    return jax.jit(_flat(function, static), compiler_options=_known(settings))
 
 
 @lru_cache(maxsize=64)
@@ -153,6 +153,9 @@ def _beside(function: Callable, static: _Key, settings: tuple) -> dict[str, Any]
 
 @lru_cache
 def _known(settings: tuple) -> dict[str, Any] | None:
+    if jax.default_backend() != "cpu":
+        return None
+
     def has(*some: tuple[str, Any]) -> bool:
         try:
             jax.jit(lambda: 0, compiler_options=dict(some)).lower().compile()
