@@ -73,7 +73,7 @@ def orient_batch(
     `lambda pair, o: assess(pair, o, sigma0=0.01)`. A function object is compiled once.
     `progress(done, total)` is called from the calling thread. `threads` (all cores) and `chunk`, pairs that are worked
     on together, are chosen if not given. Other keywords are those of `orient`. The results are those of `orient` one by
-    one, to rounding. Up to 256 MB of results that nobody holds any more are kept as memory for the next ones.
+    one, to rounding. Up to 512 MB of results that nobody holds any more are kept as memory for the next ones.
     """
     if read is not None and select is not _everything:
         raise ValueError("select and read exclude each other; read sees the orientation, too")

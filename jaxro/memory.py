@@ -43,5 +43,5 @@ class Memory:
                 del self.kept[0]
 
 
-RESULTS = Memory(1 << 28)
+RESULTS = Memory(1 << 29)
 """Of `orient_batch` and its like."""

@@ -95,27 +95,40 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
             target[begin:end] = np.asarray(source)[: end - begin]
         return end - begin
 
-    work = lambda begin: store(begin, part(begin) if first is None or begin else first)
-    _shared(work, begins, min(way.threads or cores, len(begins)) - 1, lambda done: report(done, total))
+    start = lambda begin: (begin, part(begin) if first is None or begin else first)
+    _shared(start, store, begins, min(way.threads or cores, len(begins)) - 1, lambda done: report(done, total))
     report(total, total)
     return out
 
 
-def _shared(work: Callable[[int], int], begins: Iterable[int], helpers: int, heard: Callable[[int], None]) -> None:
-    """work(begin) of every slab by the calling thread and `helpers` others, each taking the next when it is free; what
-    is done is `heard` in the calling thread. After an error or an interrupt nobody begins another."""
+def _shared(
+    start: Callable[[int], tuple],
+    store: Callable[..., int],
+    begins: Iterable[int],
+    helpers: int,
+    heard: Callable[[int], None],
+) -> None:
+    """store(*start(begin)) of every slab by the calling thread and `helpers` others, each taking the next when it is
+    free; what is done is `heard` in the calling thread. After an error or an interrupt nobody begins another."""
     left, done = deque(begins), []
+
+    def taken() -> tuple | None:
+        try:
+            begin = left.popleft()
+        except IndexError:
+            return None
+        return start(begin)
 
     def go(heard: Callable[[int], None]) -> None:
         try:
-            while True:
-                try:
-                    begin = left.popleft()
-                except IndexError:
-                    return
-                done.append(work(begin))
+            slab = taken()
+            while slab is not None:
+                # the next is calculated while this one is stored, but for the last ones, which are for the others
+                following = taken() if len(left) > helpers else None
+                done.append(store(*slab))
                 if left:
                     heard(sum(done))
+                slab = following or taken()
         finally:
             left.clear()
 

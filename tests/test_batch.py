@@ -208,15 +208,15 @@ class Doubled(Program):
 
     outputs = None
 
-    def __init__(self, bad=None):
-        self.bad, self.outputs, self.began = bad, {}, []
+    def __init__(self, bad=None, becomes=None):
+        self.bad, self.becomes, self.outputs, self.began = bad, becomes, {}, []
 
     def __call__(self, data):
         self.began.append(int(data[0]))
         time.sleep(1e-4)  # lets the others have their turn, as a program does
         if data[0] == self.bad:
             raise OSError("no more")
-        return 2 * data
+        return 2 * data if self.becomes is None else self.becomes
 
 
 def test_slabs_are_shared_and_an_end_is_one_for_all():
@@ -236,6 +236,21 @@ def test_slabs_are_shared_and_an_end_is_one_for_all():
         with pytest.raises(KeyboardInterrupt):
             slabs.spread(data, run, slabs.Way(threads, slab=1), 1, _interrupted)
         assert len(run.began) < 100
+
+
+def test_the_next_slab_is_calculated_while_one_is_stored():
+    seen = []
+
+    class Calculating:
+        shape, dtype = (1,), np.dtype(int)
+
+        def __array__(self, dtype=None, copy=None):
+            seen.append(len(run.began))
+            return np.zeros(1, int)
+
+    run = Doubled(becomes=Calculating())
+    slabs.spread(np.arange(10), run, slabs.Way(1, slab=1), 1)
+    assert seen == [2, 3, 4, 5, 6, 7, 8, 9, 10, 10]
 
 
 def _interrupted(done, total):
