@@ -9,7 +9,7 @@ import weakref
 
 import numpy as np
 
-LARGE = 1 << 22
+LARGE = 1 << 16
 """Bytes from which on memory is kept; smaller pieces are used again by the allocator itself."""
 
 

@@ -72,7 +72,7 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
     begins = range(0, total, size)
 
     def part(begin: int) -> PyTree:
-        slab = jax.tree.map(lambda a: _filled(a[begin : begin + size], size), data)
+        slab = _filled(jax.tree.map(lambda a: a[begin : begin + size], data), size)
         if len(devices) == 1:
             return run(slab)
         with jax.default_device(devices[begin // size % len(devices)]):
@@ -172,11 +172,15 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _filled(a: np.ndarray, size: int) -> np.ndarray:
-    """The array with zeros (mask False: empty pairs) up to `size` rows."""
-    if a.shape[0] == size:
-        return a
-    return np.concatenate([a, np.zeros((size - a.shape[0], *a.shape[1:]), a.dtype)])
+def _filled(slab: PyTree, size: int) -> PyTree:
+    """The slab with zeros (mask False: empty pairs) up to `size` rows."""
+    rows = jax.tree.leaves(slab)[0].shape[0]
+    if rows == size:
+        return slab
+    filled = _room(jax.tree.map(lambda a: jax.ShapeDtypeStruct((size, *a.shape[1:]), a.dtype), slab))
+    for target, source in zip(jax.tree.leaves(filled), jax.tree.leaves(slab), strict=True):
+        target[:rows], target[rows:] = source, 0
+    return filled
 
 
 def _rounded(chunks: int) -> int:
@@ -186,7 +190,7 @@ def _rounded(chunks: int) -> int:
 
 
 def _room(shapes: PyTree) -> PyTree:
-    """Memory for a result, aligned as JAX wants it, all in one piece, for which the system gives large pages: each is
+    """Memory for a slab or a result, aligned as JAX wants it, all in one piece, for which the system gives large pages: each is
     zeroed at its first use, and the small ones of many pieces cost a fifth of a large result."""
     leaves, structure = jax.tree.flatten(shapes)
     sizes = [-(-math.prod(leaf.shape) * leaf.dtype.itemsize // ALIGNMENT) * ALIGNMENT for leaf in leaves]
