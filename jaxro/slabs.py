@@ -190,8 +190,8 @@ def _rounded(chunks: int) -> int:
 
 
 def _room(shapes: PyTree) -> PyTree:
-    """Memory for a slab or a result, aligned as JAX wants it, all in one piece, for which the system gives large pages: each is
-    zeroed at its first use, and the small ones of many pieces cost a fifth of a large result."""
+    """Memory for a slab or a result, aligned as JAX wants it, all in one piece, for which the system gives large pages:
+    each is zeroed at its first use, and the small ones of many pieces cost a fifth of a large result."""
     leaves, structure = jax.tree.flatten(shapes)
     sizes = [-(-math.prod(leaf.shape) * leaf.dtype.itemsize // ALIGNMENT) * ALIGNMENT for leaf in leaves]
     room = memory.RESULTS.room(sum(sizes) + ALIGNMENT)

@@ -17,7 +17,7 @@ import pytest
 import jaxro
 from jaxro import DependentElements, batch, program_store, simulation, slabs, starts
 from jaxro.elements import vertical
-from jaxro.memory import LARGE, Memory
+from jaxro.memory import LARGE, PIECES, Memory
 from jaxro.programs import FAST, Program, whole
 
 
@@ -273,6 +273,10 @@ def test_memory_is_used_again_only_when_nobody_holds_it(pairs):
     three = [store.room(size) for _ in range(3)]
     del second, three
     assert sum(piece.nbytes for piece in store.kept) <= store.limit
+    many = [store.room(LARGE) for _ in range(2 * PIECES)]
+    store.limit = 4 * PIECES * LARGE
+    del many
+    assert len(store.kept) <= PIECES
     # a result that is held, even only a part of it, stays what it was
     near = jax.tree.map(lambda a: np.tile(np.asarray(a)[1::3], (800, *[1] * (a.ndim - 1))), pairs)
     once = jaxro.orient_batch(near, select=_model)[0]
