@@ -47,4 +47,4 @@ class Memory:
 
 
 RESULTS = Memory(1 << 29)
-"""Of `orient_batch` and its like."""
+"""Of `orient_batch` and its like, and of what they fill up."""

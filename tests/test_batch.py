@@ -261,6 +261,15 @@ def _model(orientation):
     return orientation.model
 
 
+def test_memory_that_a_program_still_reads_is_not_used_again():
+    program = jax.jit(lambda x: jax.lax.fori_loop(0, 200, lambda _, y: jnp.sin(y) + x, x))
+    rows, size = 3 << 14, 1 << 16
+    expected = program(np.concatenate([np.ones(rows), np.zeros(size - rows)]))
+    found = program(slabs._filled(np.ones(rows), size))  # goes on in another thread
+    slabs._filled(np.full(rows, 7.0), size)
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_memory_is_used_again_only_when_nobody_holds_it(pairs):
     store, size = Memory(4 * LARGE), 2 * LARGE
     first = store.room(size)
