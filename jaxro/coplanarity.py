@@ -84,10 +84,15 @@ def y_parallax(rows: tuple, point: Point, focal_left: Scalar, focal_right: Scala
     return focal_left * (y2 * z1 - y1 * z2) * (1 / (z1 * z2))
 
 
+def parallax_of(pair: Pair, pose: AbstractElements) -> Callable:
+    """q of a point of a pair, as a function of its coordinates."""
+    rows = tuple(frame[1:] for frame in turned(*pose.relative()))
+    return lambda point: y_parallax(rows, point, pair.focal_left, pair.focal_right)
+
+
 def parallaxes(pair: Pair, pose: AbstractElements) -> Float[Array, " point"]:
     """q of all points of a pair, whether they take part or not."""
-    rows = tuple(frame[1:] for frame in turned(*pose.relative()))
-    return jax.vmap(lambda point: y_parallax(rows, point, pair.focal_left, pair.focal_right))(pair.coordinates)
+    return jax.vmap(parallax_of(pair, pose))(pair.coordinates)
 
 
 def rigorous(pair: Pair) -> Adjusted:

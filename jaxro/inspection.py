@@ -43,7 +43,8 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
         left, right = (jnp.where(depth > 0, 1.0, -1.0) for depth in depths)
         g, square, _ = coplanarity.linearised(f, point, use)
         length = rot.dot(first, first)
-        ratio = w2 / (length * rot.dot(second, second) * sigma**2)
+        # XLA gives a quotient that is used twice a loop of its own, but not a selection of it
+        ratio = jnp.where(use, w2 / (length * rot.dot(second, second) * sigma**2), 0.0)
         radius = length - pair.focal_left**2
         terms = left + right, g * g / square, radius, ratio * sigma**2, ratio * seen**2
         return tuple(jnp.where(use, term, 0.0) for term in terms)

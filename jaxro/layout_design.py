@@ -24,12 +24,13 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from . import coplanarity, normal_equations as normal, rotations as rot
-from .adjustment import Adjustment, Residuals, read
+from .adjustment import Adjustment, read
 from .elements import AbstractElements, DependentElements, vertical
 from .guarded import root
 from .pairs import Pair
 from .programs import QUICK, Program, traced
 from .reductions import total
+from .residuals import Residuals
 from .simulation import Layout, mock_pair
 
 Positions = tuple[Float[Array, "point"], Float[Array, "point"]]

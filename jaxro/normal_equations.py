@@ -177,7 +177,7 @@ def inverse(n: Lower) -> tuple[Lower, Scalar]:
 class GaussNewton(optx.AbstractLeastSquaresSolver):
     """Gauss-Newton for a few parameters; its loop carries the parameters and two step sizes, nothing else.
 
-    `args` that know their own residuals and columns, and how a step follows others (`adjustment.Residuals`), are asked
+    `args` that know their own residuals and columns, and how a step follows others (`residuals.Residuals`), are asked
     for them; any other residual function is linearised. Ends when the *next* step, predicted from the last two, is
     below atol + rtol |x|, or below ROUNDING in their place if steps no longer fall: they are rounding errors then.
     `max_step` bounds the largest component of a step (0.5 rad for orientations, where a
@@ -252,7 +252,7 @@ class SmallCholesky(lx.AbstractLinearSolver):
 
 
 def steps(residuals: Any, x: tuple[Scalar, ...], count: int, max_step: float) -> tuple[Scalar, ...]:
-    """A fixed number of Gauss-Newton steps on `adjustment.Residuals`, for starts that need no convergence test."""
+    """A fixed number of Gauss-Newton steps on `residuals.Residuals`, for starts that need no convergence test."""
     solver = GaussNewton(max_step=max_step)
 
     def body(_, x):

@@ -18,11 +18,12 @@ from .elements import AbstractElements, DependentElements, IndependentElements, 
 from .guarded import root, times
 from .inspection import Inspection, inspect
 from .losses import AbstractLoss
-from .model_points import model_points
+from .model_points import model_point
 from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned, double
+from .pointwise import pointwise
 from .programs import FAST, QUICK, QUICKEST, Program, loops, traced, whole
-from .reductions import count, total
+from .reductions import sums, total
 from .results import RESULTS, is_usable
 
 WEAK = 0.04
@@ -204,14 +205,15 @@ def _inspected(
     length = _length(pair, elements, base, pose)
     chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
 
-    parallax = jnp.where(pair.mask, coplanarity.parallaxes(pair, pose), 0.0)
     unit = pose.bx, pose.by, pose.bz
-    model, in_front, far = model_points(pair, pose, chosen, elements.scale(unit, length))
+    q_of, meet = coplanarity.parallax_of(pair, pose), model_point(pair, pose, chosen, elements.scale(unit, length))
+    of_point = lambda point, use: (jnp.where(use, q_of(point), 0.0), *meet(point, use))
+    parallax, model, in_front, behind = pointwise(of_point, pair.coordinates, pair.mask)
 
     freedom = adjustment.degrees_of_freedom
     checked = freedom > 0
-    qq = total(parallax**2) / jnp.where(checked, freedom, 1).astype(parallax.dtype)
-    m_q = jnp.where(checked, root(qq), jnp.nan)
+    qq, behind = sums((parallax**2, (behind & ~pair.coarse).astype(parallax.dtype)))
+    m_q = jnp.where(checked, root(qq / jnp.where(checked, freedom, 1).astype(parallax.dtype)), jnp.nan)
 
     result = adjustment.result
     fair = result == RESULTS.successful
@@ -227,7 +229,7 @@ def _inspected(
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous | second, RESULTS.two_solutions),
-        (count(pair.mask & ~in_front & ~far & ~pair.coarse) > 0, RESULTS.points_behind_camera),
+        (behind > 0, RESULTS.points_behind_camera),
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
         (
             ~elements.exist(unit, length)
@@ -242,7 +244,7 @@ def _inspected(
     result = RESULTS.where(rotated, RESULTS.zero_base, result)
     result = RESULTS.where(freedom < 0, RESULTS.too_few_points, result)
     result = RESULTS.where(bad_input, RESULTS.non_finite_input, result)
-    orientation = Orientation(
+    return Orientation(
         pose,
         chosen,
         q,
@@ -256,8 +258,7 @@ def _inspected(
         jnp.maximum(freedom, 0),
         adjustment.iterations,
         result,
-    )
-    return orientation, inspected
+    ), inspected
 
 
 def _corrections_of(poses_and_pairs: tuple[RelativePose, Pair]) -> Coordinates:

@@ -39,7 +39,7 @@ QUICKEST = {**QUICK, "xla_backend_optimization_level": 0}
 """For what is done once: compiles in another fifth less of the time, and a single pair of few points takes a tenth
 longer."""
 
-ONE_KERNEL = {"xla_cpu_experimental_ynn_fusion_type": ""}
+ONE_KERNEL = {"xla_cpu_experimental_ynn_fusion_type": "", "xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
 """No sums by a library, which a kernel cannot call."""
 
 
@@ -199,12 +199,17 @@ def loops(function: Callable) -> Callable:
     return within
 
 
+def in_kernel() -> bool:
+    """Whether a kernel is being made."""
+    return _kernels.value
+
+
 def part(function: Callable) -> Callable:
     """Where kernels are made a kernel of its own, which the compiler makes better than a piece of a large one.
 
     Elsewhere a function of its own, whose loops are batched in a fifth less of the time.
     """
-    return _call(function, **_AS_ONE) if _kernels.value else eqx.filter_jit(function)
+    return _call(function, **_AS_ONE) if in_kernel() else eqx.filter_jit(function)
 
 
 def while_loop(more: Callable, turn: Callable, state: PyTree, like: Array) -> PyTree:

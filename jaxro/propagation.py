@@ -13,11 +13,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .adjustment import Adjustment, moved
+from .adjustment import Adjustment
 from .guarded import root
 from .orientation import Orientation
 from .programs import traced
 from .reductions import total
+from .residuals import moved
 
 ROUNDING = 1e-9
 """Of the sum of all parts of a variance: as much below zero as it may come out by rounding."""

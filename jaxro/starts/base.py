@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
 from .. import coplanarity
-from ..adjustment import Residuals
 from ..elements import AbstractElements, RelativePose, vertical
 from ..normal_equations import steps
 from ..pairs import Pair
+from ..residuals import Residuals
 
 LONGEST = 0.5
 """Longest component of a step towards a start (rad)."""
