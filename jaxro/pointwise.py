@@ -14,15 +14,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from .programs import in_kernel, stage
+from .programs import of_many, stage
 
 
 def pointwise(function: Callable, *points: PyTree) -> Any:
-    """function(*point) of every point, as `jax.vmap(function)(*points)`; in a kernel by one loop.
+    """function(*point) of every point, as `jax.vmap(function)(*points)`; in a kernel of many pairs by one loop.
 
     The function may close over anything that is traced.
     """
-    if not in_kernel():
+    if not of_many():
         return jax.vmap(function)(*points)
     first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), points)
     closed = eqx.filter_closure_convert(function, *first)

@@ -12,7 +12,7 @@ from ..normal_equations import accumulate, cholesky, substitute
 from ..orientation import orient
 from ..pairs import Pair, cleaned
 from ..programs import stage
-from ..reductions import count, total
+from ..reductions import count, sums, total
 from ..simulation import noisy, planted
 from .base import (
     AbstractProcedure,
@@ -77,8 +77,10 @@ def closed_form(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElemen
 
     def one(own, *change):
         moved = q + sum(column * c for column, c in zip(a, change, strict=True))
+        # Σ |moved| as two sums in one pass: a single one XLA computes after all n² numbers have been written
+        above, below = sums((jnp.maximum(moved, 0.0), jnp.maximum(-moved, 0.0)))
         # a point not in use has q = a = 0
-        return (total(jnp.abs(moved)) - own) / jnp.maximum(count(mask), 1.0)
+        return (above + below - own) / jnp.maximum(count(mask), 1.0)
 
     own = jnp.abs(q + sum(x * y for x, y in zip(a, change, strict=True)))
     return jax.vmap(one)(own, *change), testable
