@@ -90,3 +90,9 @@ def ratio(key: str, peer: float, ours: float, goal: float | None) -> Metric:
 def pose(orientation: jaxro.Orientation) -> jaxro.RelativePose:
     """What the peers compute; the rest is then not computed by ours either."""
     return orientation.pose
+
+
+def listed(orientation: jaxro.Orientation) -> tuple:
+    """What makes an orientation whole: the pose, covariance, residuals, redundancy numbers and model points."""
+    o = orientation
+    return o.pose, o.covariance, o.residuals, o.redundancy, o.model

@@ -20,7 +20,7 @@ from jaxro.orientation import orient_near
 from jaxro.programs import QUICKEST, known, whole
 
 from . import peers
-from .common import Size, agreement, pair_of, pose, poses, rate, ratio, ready, share
+from .common import Size, agreement, listed, pair_of, pose, poses, rate, ratio, ready, share
 from .metrics import Metric, median_seconds
 from .workload import aerial
 
@@ -35,6 +35,7 @@ def refinement(size: Size) -> list[Metric]:
         part = share(coordinates, min(len(few[0]), 10_000))
         contestants: dict[str, Callable] = {
             "pose": partial(ready, partial(jaxro.orient_batch, select=pose), ours),
+            "listed": partial(ready, partial(jaxro.orient_batch, select=listed), ours),
             "whole": partial(ready, jaxro.orient_batch, ours),
             "optimistix": partial(ready, peers.stock_optimistix(), *part),
         }
@@ -48,7 +49,7 @@ def refinement(size: Size) -> list[Metric]:
             ]
             del answers
             seconds = median_seconds({**contestants, "poselib": poselib.run}, size.repeats)
-        each = {"pose": pairs, "whole": pairs, "optimistix": len(part[0]), "poselib": len(few[0])}
+        each = {"pose": pairs, "listed": pairs, "whole": pairs, "optimistix": len(part[0]), "poselib": len(few[0])}
         per_pair = {name: seconds[name] / count for name, count in each.items()}
         metrics += [
             rate(f"{label}: jaxro, pose", per_pair["pose"]),
@@ -58,6 +59,13 @@ def refinement(size: Size) -> list[Metric]:
             ratio(f"{label}: pose against PoseLib in two processes", per_pair["poselib"], per_pair["pose"], goal),
             ratio(f"{label}: pose against optimistix", per_pair["optimistix"], per_pair["pose"], stock_goal),
             ratio(f"{label}: whole against PoseLib in two processes", per_pair["poselib"], per_pair["whole"], None),
+            Metric(
+                f"{label}: covariance, residuals, redundancy, model against pose",
+                per_pair["listed"] / per_pair["pose"],
+                "times",
+                "lower",
+                goal=2,
+            ),
             Metric(f"{label}: whole against pose", per_pair["whole"] / per_pair["pose"], "times", "lower", goal=2),
         ]
     return metrics

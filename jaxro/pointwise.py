@@ -1,8 +1,8 @@
 """Several results of every point, in one loop.
 
 XLA's CPU backend makes one loop of each array that is a result, and computes in each all that leads up to it: seven
-results that share most of their work cost seven times that work. A variadic reduction is the one operation with several
-results that it makes one loop of; this one reduces an axis of a single number.
+results that share most of their work cost seven times that work. The one operation with several results that it makes
+one loop of is a variadic reduction; this one adds a zero to every number.
 """
 
 from collections.abc import Callable

@@ -18,7 +18,8 @@ import jaxro
 from jaxro import DependentElements, batch, program_store, simulation, slabs, starts
 from jaxro.elements import vertical
 from jaxro.memory import LARGE, PIECES, Memory
-from jaxro.programs import FAST, Program, whole
+from jaxro.pointwise import pointwise
+from jaxro.programs import FAST, ONE_KERNEL, Program, whole, whole_of_many
 
 
 def mixed(count=150, points=9):
@@ -136,18 +137,47 @@ def test_only_what_is_selected_and_progress(pairs):
     assert [done for done, _ in told] == sorted(done for done, _ in told) and told[-1][0] == 150
 
 
-def test_one_kernel_gives_what_many_give(pairs):
+@pytest.mark.parametrize("kernel", [whole, whole_of_many])
+def test_one_kernel_gives_what_many_give(pairs, kernel):
     options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
     few = jax.tree.map(lambda a: a[:96], pairs)
-    programs = [Program(batch._slab_near, options, FAST, kernel=kernel) for kernel in (whole, None)]
+    programs = [Program(batch._slab_near, options, FAST, kernel=kernel) for kernel in (kernel, None)]
     (one, fits), (many, again) = (jax.tree.map(np.asarray, program(few)) for program in programs)
     assert not programs[0].refused
     np.testing.assert_array_equal(fits, again)
     np.testing.assert_array_equal(one.iterations[fits], many.iterations[fits])
-    for a, b in zip(
-        jax.tree.leaves((one.pose, one.deviations)), jax.tree.leaves((many.pose, many.deviations)), strict=True
-    ):
-        np.testing.assert_allclose(a[fits], b[fits], rtol=1e-9, atol=1e-12)
+    for part in ("pose", "deviations", "parallax", "residuals", "redundancy", "model", "in_front", "m_q", "result"):
+        for a, b in zip(jax.tree.leaves(getattr(one, part)), jax.tree.leaves(getattr(many, part)), strict=True):
+            np.testing.assert_allclose(a[fits], b[fits], rtol=1e-9, atol=1e-11, err_msg=part)
+
+
+def test_results_of_points_are_one_loop_each_of_vectors(pairs):
+    """A reduction with the two results of the adjustment and one with the six of the oriented pair. If their calls were
+    not marked any more, they would be inlined, read dozens of arrays, and be loops of single numbers."""
+    host = jax.tree.map(np.asarray, pairs)
+    options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
+    run = jax.jit(lambda data: whole_of_many(batch._slab_near)(data, **options), compiler_options=FAST | ONE_KERNEL)
+    compiled = run.lower(jax.tree.map(lambda a: a[:96], host)).compile().as_text()
+    results, arguments = zip(*re.findall(r"= \(([^)]*32,9\][^)]*)\) fusion\((.*?)\), kind", compiled), strict=True)
+    assert sorted(each.count("[32,9]") for each in results) == [2, 6]
+    assert all(each.count("%") <= 8 for each in arguments)  # the arrays of the points, and their numbers as one
+
+
+def test_points_in_one_loop_are_points_one_by_one():
+    x, use = jnp.asarray([1.0, -2.0, jnp.nan, jnp.inf, 0.0]), jnp.arange(5) < 3
+
+    def several(x, use, scale):
+        return {"flag": use & (x > 0), "moved": jnp.where(use, x * scale, 1.0), "twice": 2 * x}
+
+    of = lambda data: pointwise(lambda x, use: several(x, use, data[2]), *data[:2])
+    slope = lambda data: jax.grad(lambda scale: jnp.sum(of((jnp.where(use, x, 0.0), use, scale))["moved"][:2]))(data[2])
+    for function in (of, slope):
+        one, many = (
+            Program(lambda data, function=function: function(data), {}, FAST, kernel=kernel)((x, use, jnp.asarray(3.0)))
+            for kernel in (whole_of_many, None)
+        )
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 def test_what_no_kernel_can_do_is_done_all_the_same(pairs):
