@@ -40,8 +40,8 @@ QUICKEST = {**QUICK, "xla_backend_optimization_level": 0}
 longer."""
 
 ONE_KERNEL = {"xla_cpu_experimental_ynn_fusion_type": "", "xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
-"""No sums by a library, which a kernel cannot call, and no loops that the compiler splits over threads of its own, which
-a kernel cannot hold: pairs are spread over threads as they are."""
+"""Neither sums by a library, which a kernel cannot call, nor loops that the compiler splits over threads of its own,
+which it cannot hold: pairs are spread over threads as they are."""
 
 
 class _Key:
@@ -182,7 +182,7 @@ _many = jax.make_user_context(False)
 
 @lru_cache(maxsize=64)
 def whole_of_many(function: Callable) -> Callable:
-    """`whole`, in which what is computed of every point is made one loop (`pointwise`): compiles for a fifth of a second
+    """`whole`, in which what is computed of every point is one loop (`pointwise`): compiles for a fifth of a second
     longer, runs in seven eighths of the time."""
 
     def within(data: PyTree, **options: Any) -> PyTree:
