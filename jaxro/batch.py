@@ -18,7 +18,7 @@ from jaxtyping import Array, PyTree
 from .elements import AbstractElements
 from .orientation import DEFAULTS, Orientation, orient, orient_near
 from .pairs import Pair, double
-from .programs import FAST, QUICK, QUICKEST, WIDE, Program, whole, whole_of_many
+from .programs import FAST, QUICK, QUICKEST, UNDIVIDED, WIDE, Program, whole, whole_of_many
 from .rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
 from .rejection.hypotheses import AbstractHypotheses
 from .slabs import Report, Way, chunked, spread, unheard
@@ -126,8 +126,9 @@ def oriented_near(
     chunk = _chunk(pairs, way.chunk)
     alone = pairs.x_left.size <= ALONE
     way = way._replace(threads=way.threads or 1, calls=0) if alone else way._replace(calls=1)  # all take as long
-    kernel = None if options.get("solver") is not None else whole if pairs.x_left.size <= MOMENT else whole_of_many
-    program = Program(_slab_near, options | {"chunk": chunk}, _settings(pairs, FAST | WIDE), kernel=kernel)
+    kernel, lasting = (whole, FAST | WIDE) if alone else (whole_of_many, FAST | WIDE | UNDIVIDED)
+    kernel = kernel if options.get("solver") is None else None
+    program = Program(_slab_near, options | {"chunk": chunk}, _settings(pairs, lasting), kernel=kernel)
     return spread(pairs, program, way, chunk, report)
 
 

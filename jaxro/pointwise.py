@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from .programs import of_many, stage
+from .reductions import added
 
 
 def pointwise(function: Callable, *points: PyTree) -> Any:
@@ -46,11 +47,7 @@ def _one_loop(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
     followed = tuple(
         lax.pad(a[..., None], zero, [(0, 0, 0)] * a.ndim + [(0, 1, 0)]) for a, zero in zip(arrays, nothing, strict=True)
     )
-    return tuple(lax.reduce(followed, nothing, _add, (arrays[0].ndim,)))
-
-
-def _add(one: tuple, other: tuple) -> tuple:
-    return tuple(a | b if a.dtype == bool else a + b for a, b in zip(one, other, strict=True))
+    return tuple(lax.reduce(followed, nothing, added, (arrays[0].ndim,)))
 
 
 @_one_loop.defjvp

@@ -39,9 +39,12 @@ QUICKEST = {**QUICK, "xla_backend_optimization_level": 0}
 """For what is done once: compiles in another fifth less of the time, and a single pair of few points takes a tenth
 longer."""
 
-ONE_KERNEL = {"xla_cpu_experimental_ynn_fusion_type": "", "xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
-"""Neither sums by a library, which a kernel cannot call, nor loops that the compiler splits over threads of its own,
-which it cannot hold: pairs are spread over threads as they are."""
+UNDIVIDED = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
+"""Loops are not split over threads of the compiler's own: for pairs that are spread over threads as they are.
+`whole_of_many` needs it, as a loop of several results cannot be split."""
+
+ONE_KERNEL = {"xla_cpu_experimental_ynn_fusion_type": ""}
+"""No sums by a library, which a kernel cannot call."""
 
 
 class _Key:

@@ -18,10 +18,11 @@ def sums(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
     if len(arrays) == 1:
         return (jnp.sum(arrays[0], axis=-1),)
     zeros = tuple(jnp.zeros((), a.dtype) for a in arrays)
-    return tuple(lax.reduce(arrays, zeros, _add, (arrays[0].ndim - 1,)))
+    return tuple(lax.reduce(arrays, zeros, added, (arrays[0].ndim - 1,)))
 
 
-def _add(one: Sequence, other: Sequence) -> tuple:
+def added(one: Sequence, other: Sequence) -> tuple:
+    """The sum of each number of the one and of the other; of flags, whether any is true."""
     return tuple(a + b for a, b in zip(one, other, strict=True))
 
 
