@@ -17,7 +17,7 @@ import numpy as np
 import jaxro
 from jaxro import coplanarity, starts
 from jaxro.orientation import orient_near
-from jaxro.programs import QUICKEST, known, whole
+from jaxro.programs import QUICKEST, known, prompt, whole
 
 from . import peers
 from .common import Size, agreement, listed, pair_of, pose, poses, rate, ratio, ready, share
@@ -132,8 +132,8 @@ def latencies(calls: int) -> dict[str, float]:
     pair = jax.device_put(pair_of(tuple(c[0] for c in aerial(1, 16))))
     near = partial(orient_near, start=starts.Auto())
     ways: dict[str, Callable] = {
-        "compiled function, pose": jax.jit(whole(lambda pair: near(pair)[0].pose), compiler_options=known(QUICKEST)),
-        "compiled function, whole Orientation": jax.jit(whole(near), compiler_options=known(QUICKEST)),
+        "compiled function, pose": prompt(whole(lambda pair: near(pair)[0].pose), known(QUICKEST)),
+        "compiled function, whole Orientation": prompt(whole(near), known(QUICKEST)),
         "orient(pair)": jaxro.orient,
         "jit(orient)(pair)": jax.jit(jaxro.orient),
     }

@@ -22,7 +22,6 @@ from .guarded import root, times
 from .losses import AbstractLoss
 from .pointwise import pointwise
 from .programs import part
-from .reductions import count
 from .residuals import Parameters, Residuals, dimension, moved, residuals_of, reweighted, together
 from .results import RESULTS
 
@@ -112,7 +111,9 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
     linearised = residuals.linearised(origin)
     groups = residuals.observations, residuals.cofactor, residuals.mask
     r, jacobian, weight = jax.vmap(linearised)(*groups)
-    n, _, squares = normal.accumulate(r, jacobian, reweighted(loss, r, weight))
+    n, _, squares, number = normal.accumulate(
+        r, jacobian, reweighted(loss, r, weight), residuals.mask.astype(origin[0].dtype)
+    )
     q, pivot = normal.inverse(n)
 
     def of_group(observation, cofactor, use):
@@ -124,7 +125,7 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
         return [[jnp.where(use, entry, 0.0) for entry in entries] for entries in (white, redundancy)]
 
     white, redundancy = pointwise(of_group, *groups)
-    freedom = len(r) * count(residuals.mask).astype(int) - p
+    freedom = len(r) * number.astype(int) - p
     checked = freedom > 0
     variance = squares / jnp.where(checked, freedom, 1).astype(origin[0].dtype)
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)

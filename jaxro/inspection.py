@@ -46,10 +46,10 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
         # XLA gives a quotient that is used twice a loop of its own, but not a selection of it
         ratio = jnp.where(use, w2 / (length * rot.dot(second, second) * sigma**2), 0.0)
         radius = length - pair.focal_left**2
-        terms = left + right, g * g / square, radius, ratio * sigma**2, ratio * seen**2
+        terms = jnp.ones_like(g), left + right, g * g / square, radius, ratio * sigma**2, ratio * seen**2
         return tuple(jnp.where(use, term, 0.0) for term in terms)
 
-    in_front, *squares = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
-    mean = lambda square: jnp.sqrt(jnp.maximum(square, 0.0) / jnp.maximum(pair.count, 1.0))
+    number, in_front, *squares = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
+    mean = lambda square: jnp.sqrt(jnp.maximum(square, 0.0) / jnp.maximum(number, 1.0))
     distance, spread, angle, parallax = map(mean, squares)
     return Inspection(in_front, distance / pair.focal_left, spread / pair.focal_left, angle, parallax)

@@ -6,6 +6,7 @@ residuals, so that no Jacobian is ever stored, and the system is solved by an un
 matrix product. Above `UNROLLED` parameters the dense routines take over.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -40,8 +41,9 @@ ROUNDING = 1e-10
 """Relative size of steps that have no use any more where they do not fall."""
 
 
-def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None):
-    """N = JᵀWJ, h = JᵀWr and rᵀWr, from residuals and columns that may come in several arrays each."""
+def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None, *more: Array):
+    """N = JᵀWJ, h = JᵀWr and rᵀWr, from residuals and columns that may come in several arrays each, and in the same
+    pass the sums of more arrays."""
     p = len(jacobian)
     parts = []
     for c, residual in enumerate(r):
@@ -49,10 +51,10 @@ def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None =
         weighted = [*column, residual] if weight is None else [weight[c] * a for a in (*column, residual)]
         products = [weighted[i] * column[j] for i in range(p) for j in range(i + 1)]
         products += [weighted[p] * a for a in column] + [weighted[p] * residual]
-        parts.append(sums(tuple(products)))
-    total = [sum(part[1:], part[0]) for part in zip(*parts, strict=True)]
+        parts.append(sums((*products, *(more if c == 0 else ()))))
+    total = [sum(part[1:], part[0]) for part in itertools.zip_longest(*parts, fillvalue=0)]
     n = [[total.pop(0) for _ in range(i + 1)] for i in range(p)]
-    return n, total[:p], total[p]
+    return n, total[:p], *total[p:]
 
 
 def columns(residual: Callable, x: Scalars) -> tuple[Columns, list[Columns], None]:

@@ -240,7 +240,7 @@ def _inspected(
         ((noise**2 * worst > WEAK**2) | (direction.margin < needed * noise) | undivided, RESULTS.weakly_determined),
     ):
         result = RESULTS.where(fair & condition_holds, code, result)
-    rotated = degeneracy.pure_rotation(inspected, pair.count - 5, noise) | begin.pure_rotation
+    rotated = degeneracy.pure_rotation(inspected, free, noise) | begin.pure_rotation
     result = RESULTS.where(rotated, RESULTS.zero_base, result)
     result = RESULTS.where(freedom < 0, RESULTS.too_few_points, result)
     result = RESULTS.where(bad_input, RESULTS.non_finite_input, result)
