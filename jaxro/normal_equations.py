@@ -41,7 +41,7 @@ ROUNDING = 1e-10
 """Relative size of steps that have no use any more where they do not fall."""
 
 
-def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None, *more: Array):
+def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None, *more: Array) -> tuple[Any, ...]:
     """N = JᵀWJ, h = JᵀWr and rᵀWr, from residuals and columns that may come in several arrays each, and in the same
     pass the sums of more arrays."""
     p = len(jacobian)

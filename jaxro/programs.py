@@ -126,7 +126,8 @@ def prompt(function: Callable, settings: dict[str, Any] | None = None) -> Callab
     call back into Python. This one may: if its first number is the largest there is, which it gets back. JAX keeps no
     such program on disk, so that where it is to keep them this is an ordinary one.
     """
-    if jax.default_backend() != "cpu" or jax.config.jax_compilation_cache_dir is not None:
+    kept = jax.config.jax_compilation_cache_dir is not None  # pyright: ignore[reportAttributeAccessIssue]
+    if kept or jax.default_backend() != "cpu":
         return jax.jit(function, compiler_options=settings)
 
     def within(*arguments):

@@ -20,9 +20,9 @@ from jaxtyping import PyTree
 from . import memory
 from .programs import Program
 
-SLAB_POINTS = 1 << 17
-"""Points per call of the compiled program: long enough to hide the call, short enough that the memory of one result is
-used again for the next and that progress is seen."""
+SLAB_POINTS = 1 << 16
+"""Points per call of the compiled program: long enough to hide the call, short enough that a result is still in the
+cache when it is put to its place, its memory is used again for the next, and progress is seen."""
 
 
 ALIGNMENT = 64
@@ -89,46 +89,35 @@ def spread(data: PyTree, run: Program, way: Way, chunk: int, report: Report = un
         run.outputs[shape] = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), first)
     out = _room(jax.tree.map(lambda a: jax.ShapeDtypeStruct((total, *a.shape[1:]), a.dtype), run.outputs[shape]))
 
-    def store(begin: int, result: PyTree) -> int:
+    def work(begin: int) -> int:
+        result = part(begin) if first is None or begin else first
         end = min(begin + size, total)
         for target, source in zip(jax.tree.leaves(out), jax.tree.leaves(result), strict=True):
             target[begin:end] = np.asarray(source)[: end - begin]
         return end - begin
 
-    start = lambda begin: (begin, part(begin) if first is None or begin else first)
-    _shared(start, store, begins, min(way.threads or cores, len(begins)) - 1, lambda done: report(done, total))
+    _shared(work, begins, min(way.threads or cores, len(begins)) - 1, lambda done: report(done, total))
     report(total, total)
     return out
 
 
-def _shared(
-    start: Callable[[int], tuple],
-    store: Callable[..., int],
-    begins: Iterable[int],
-    helpers: int,
-    heard: Callable[[int], None],
-) -> None:
-    """store(*start(begin)) of every slab by the calling thread and `helpers` others, each taking the next when it is
-    free; what is done is `heard` in the calling thread. After an error or an interrupt nobody begins another."""
+def _shared(work: Callable[[int], int], begins: Iterable[int], helpers: int, heard: Callable[[int], None]) -> None:
+    """work(begin) of every slab by the calling thread and `helpers` others, each taking the next when it is free; what
+    is done is `heard` in the calling thread. After an error or an interrupt nobody begins another."""
     left, done = deque(begins), []
 
-    def taken() -> tuple | None:
+    def taken() -> int | None:
         try:
-            begin = left.popleft()
-        except IndexError:
+            return left.popleft()
+        except IndexError:  # asked first, another thread could be quicker
             return None
-        return start(begin)
 
     def go(heard: Callable[[int], None]) -> None:
         try:
-            slab = taken()
-            while slab is not None:
-                # the next is calculated while this one is stored, but for the last ones, which are for the others
-                following = taken() if len(left) > helpers else None
-                done.append(store(*slab))
+            while (begin := taken()) is not None:
+                done.append(work(begin))
                 if left:
                     heard(sum(done))
-                slab = following or taken()
         finally:
             left.clear()
 
