@@ -18,11 +18,11 @@ from jaxro.programs import FAST, Program, prompt
 @pytest.fixture
 def unkept():
     folder = jax.config.jax_compilation_cache_dir
-    for there in (None, folder):
-        jax.config.update("jax_compilation_cache_dir", there)
-        programs._compiled.cache_clear()
-        if there is None:
-            yield
+    jax.config.update("jax_compilation_cache_dir", None)
+    programs._compiled.cache_clear()
+    yield
+    jax.config.update("jax_compilation_cache_dir", folder)
+    programs._compiled.cache_clear()
 
 
 def long(x):
