@@ -50,7 +50,7 @@ def test_arrays_of_any_kind(unkept, data):
 
 def test_batches_from_two_threads_at_once_are_those_of_kept_programs(request):
     vertical = simulation.mock_pair(simulation.standard_layout(16))
-    pairs = jax.vmap(lambda key: simulation.noisy(vertical, key, 0.01))(jax.random.split(jax.random.key(5), 300))
+    pairs = jax.vmap(lambda key: simulation.noisy(vertical, key, 0.01))(jax.random.split(jax.random.key(5), 3000))
     kept = jaxro.orient_batch(pairs)
     request.getfixturevalue("unkept")
     with ThreadPoolExecutor(2) as pool:
