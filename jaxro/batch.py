@@ -21,14 +21,15 @@ from .pairs import Pair, double
 from .programs import FAST, QUICK, QUICKEST, UNDIVIDED, WIDE, Program, whole, whole_of_many
 from .rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
 from .rejection.hypotheses import AbstractHypotheses
+from .rejection.search import Search
 from .slabs import Report, Way, chunked, spread, unheard
 from .starts import AbstractStart, Auto
 
 CHUNK_POINTS = 16384
 """Points per chunk: a working set of a few hundred kB, which stays in the cache of one core."""
 
-SEARCHED = 16
-"""Pairs per chunk at most where random subsets are tried."""
+SUBSETS = 512
+"""Random subsets that are solved together."""
 
 ALONE = 1 << 15
 """Points of a batch that are oriented from the vertical before other threads have begun."""
@@ -179,8 +180,8 @@ def decided(
     """What is selected of every pair's rejection, in NumPy, and for which pairs the procedure was in doubt."""
     chunk = _chunk(pairs, way.chunk)
     # a search has many subsets of each pair in work, and goes on until the last pair of its chunk is served
-    if _by_subsets(procedure) and way.chunk is None:
-        chunk = min(chunk, SEARCHED)
+    if way.chunk is None:
+        chunk = min(chunk, _searched_together(procedure))
     program = Program(_slab_cleaned, {"procedure": procedure, "select": select, "chunk": chunk}, _settings(pairs))
     return spread(pairs, program, way, chunk, report)
 
@@ -205,9 +206,12 @@ def map_batch(
     return _finish(spread(host, program, way, chunk, progress or unheard))
 
 
-def _by_subsets(procedure: AbstractProcedure) -> bool:
-    subsets = lambda part: isinstance(part, AbstractHypotheses)
-    return any(map(subsets, jax.tree.leaves(procedure, is_leaf=subsets)))
+def _searched_together(procedure: AbstractProcedure) -> int:
+    """Pairs per chunk at most, by the subsets of each pair that are in work."""
+    kinds = (AbstractHypotheses, Search)
+    is_kind = lambda part: isinstance(part, kinds)
+    blocks = [part.block for part in jax.tree.leaves(procedure, is_leaf=is_kind) if is_kind(part)]
+    return min([max(SUBSETS // block, 1) for block in blocks], default=1 << 16)
 
 
 def _chunk(pairs: Pair, chunk: int | None) -> int:

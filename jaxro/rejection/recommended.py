@@ -1,14 +1,29 @@
-"""The procedure to begin with, made of what the comparisons prove best."""
+"""The procedure to begin with: hypotheses that are compared, and verdicts that are held against chance.
 
+1. `Plain`: all points, from the vertical. If they pass the global test and no |w| exceeds its limit, nothing is
+   searched and nothing rejected.
+2. `Quick`: graduated weights from the vertical, held against a few random subsets of five points in any position.
+   Believed only if the points kept pass the global test with the given standard deviation and are no accident.
+3. `NearVertical`: of few points many subsets, solved from the vertical; believed in the same way.
+4. `Thorough`: the best of these held against random subsets in any position until a better orientation would have been
+   met.
+
+Every orientation is compared by the same truncated cost. What is found is solved by least squares, and every point, in
+use or not, judged anew by its normalised residual |w| at the familywise level, in turns: a good point that a search
+lost comes back. Where few points are out, the same is done point by point from all points, by which few and small
+errors are found best.
+"""
+
+import abc
 import dataclasses
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.special import gammaln
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .. import critical_values
 from ..conditions import linearised
@@ -16,59 +31,142 @@ from ..elements import RelativePose, vertical
 from ..pairs import Pair, cleaned
 from ..programs import while_loop
 from ..reductions import count, total
+from . import evidence
 from .base import OUTCOMES, AbstractProcedure, Rejection
 from .graduated_non_convexity import GraduatedNonConvexity
-from .hypotheses import EightPoint, FivePoint, Newton
+from .hypotheses import Newton, squares
+from .noise import noise_of
 from .ransac import Ransac
-from .robust import AbstractSearch, agreeing, in_front, judged, one_by_one, scaled, seen
+from .robust import agreeing, improved, judged, normalised, one_by_one, scaled, seen, stepped
+from .search import Search, score
+
+Use = Bool[Array, "point"]
+
+ROUNDS = 10
+"""Turns of least squares and judgement of every point."""
+
+FEW = 7
+"""Points out up to which they are also judged one by one, beginning with all of them."""
+
+DEVIATIONS = 3.0
+"""The level of the global test, as multiple of a standard deviation of a normal number."""
+
+UNKNOWN = 3000.0
+"""Where the standard deviation is not known the search begins with a focal length divided by this."""
+
+FADING = 2.5
+"""Multiple of the noise at which the weight of a point has faded to a quarter, where the noise is not normal."""
+
+HEAVY = 3.0
+"""Standard deviations by which the mean fourth power of the residuals exceeds that of normal ones where they are none."""
+
+CORE, WITHIN_CORE = 2.0, 0.774
+"""Multiple of the noise within which it is estimated, and the mean square there of normal numbers of variance 1."""
 
 
-class Stage(eqx.Module):
-    """A search; the expected number of accidents up to which it is believed; the fewest points of a pair for it."""
+class Decision(NamedTuple):
+    """The pose, the points that agree with it, whether that is believed, and the noise in units of the given sigma."""
 
-    search: AbstractSearch
-    accidents: float
-    fewest: int = 0
+    pose: RelativePose
+    use: Use
+    believed: Bool[Array, ""]
+    scale: Float[Array, ""]
+
+
+class AbstractStage(eqx.Module):
+    """A way to decide on a pair, for the pairs that the stage before left open."""
+
+    @abc.abstractmethod
+    def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
+        """Decide on one pair by |w| <= limit."""
+
+
+class Plain(AbstractStage):
+    """All points, in `steps` of least squares from the vertical. Believed if they pass the global test and every |w| its
+    limit."""
+
+    steps: int = 8
+
+    def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
+        pose = _from_vertical(pair, self.steps)
+        return Decision(pose, pair.mask, _untouched(pair, pose, limit), jnp.ones_like(limit))
+
+
+class Quick(AbstractStage):
+    """The graduated search, held against a few subsets. Believed if at least `share` of the points are kept, these pass
+    the global test, and sets as good are not expected by accident more than `accidents` times."""
+
+    graduated: GraduatedNonConvexity = GraduatedNonConvexity()
+    search: Search = Search(count=4, block=4, finalists=2)
+    share: float = 0.4
+    accidents: float = 1e-4
+
+    def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
+        found = self.search.run(pair, self.search.begin(pair, self.graduated.search(pair)), 1)
+        return _believed_if_it_fits(pair, *settled(pair, found.pose, limit), limit, self.share, self.accidents)
+
+
+class NearVertical(AbstractStage):
+    """Subsets solved by Newton's method from the vertical, for pairs of at most `most` points: of few points this finds
+    what a search in any position takes long for. Believed as `Quick` is."""
+
+    search: Ransac = Ransac(hypotheses=Newton(block=64), count=1024, limit=5.0)
+    most: int = 32
+    share: float = 0.4
+    accidents: float = 0.02
+
+    def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
+        small = count(pair.mask) <= self.most
+        pair = cleaned(pair.with_mask(pair.mask & small))[0]
+        pose, use = settled(pair, self.search.search(pair), limit)
+        decision = _believed_if_it_fits(pair, pose, use, limit, self.share, self.accidents)
+        return decision._replace(believed=decision.believed & small)
+
+
+class Thorough(AbstractStage):
+    """Random subsets until a better orientation would have been met, and the evidence for what is found.
+
+    Believed if the subsets were enough for the share of points kept, and sets as good are not expected by accident more
+    than `accidents` times, by the chance of agreement that partners shifted among the points and the orientations that
+    lost have on this scene. Points that repeat others count once. Where sigma is not `known` it is only where the
+    search begins: the noise found takes its place.
+    """
+
+    graduated: GraduatedNonConvexity = GraduatedNonConvexity()
+    search: Search = Search()
+    accidents: float = 1e-3
+    known: bool = True
+
+    def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
+        again, key = evidence.repeats(pair)
+        once = cleaned(pair.with_mask(pair.mask & ~again))[0]
+        best, other = self.graduated.search(once), _from_vertical(once, 8)
+        better = score(once, other, self.search.limit) < score(once, best, self.search.limit)
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), other, best)
+        found = self.search.run(once, self.search.begin(once, best))
+        noise = noise_of(squares(once, found.pose), once.mask)
+        scale = jnp.where(noise.known, noise.sigma, 1.0)
+        if not self.known:
+            once = _rescaled(once, scale)
+            pair = _rescaled(pair, scale)
+        pose, use = settled(once, found.pose, limit)
+        agreed, asked = evidence.shifted_agreement(once, pose, limit)
+        chance = jnp.maximum((agreed + 1) / (asked + 2), found.agreed / jnp.maximum(found.asked, 1.0))
+        certain = evidence.accidents(chance, count(once.mask), count(use)) <= math.log(self.accidents)
+        thorough = found.counted >= self.search.enough(once, pose)
+        return Decision(pose, evidence.with_repeats(use, again, key), certain & thorough, scale)
 
 
 class Recommended(AbstractProcedure):
-    """Searches, each only where the one before found nothing convincing, then normalised residuals.
+    """The stages in turn, each where the one before was not believed; `no_consensus` where the last is not.
 
-    1. Graduated non-convexity from the vertical: no subsets, its work grows with n; right in nearly all near-vertical
-       pairs of fifty and more points with half of them wrong. Skipped for pairs of fewer than thirty points, where it
-       sometimes ends in a wrong set that still convinces.
-    2. Random subsets of five points solved by Newton's method from the vertical: for few points, and where 1 fails.
-    3. Random subsets of eight points, solved linearly: for photos in any position.
-    4. Thirty times as many as in 2: for few points of near-vertical photos, half of them wrong.
-    5. Random subsets solved by the five-point method: for what is left, such as plane scenes in any position.
-
-    What is found is solved by least squares, and every point, in use or not, judged anew by its normalised residual
-    |w| at the familywise `level`, in turns: a good point that a search lost comes back. Where no more than `few` are
-    out, the same is done point by point from all points, by which few and small errors are found best; that set is
-    taken if it rests and costs less, by `robust.one_by_one`: among few points, one that would bend the solution to
-    itself is therefore rejected at a |w| a little below the limit.
-
-    How convincing a set of k of n points is, is told by the expected number C(n, k) p^(k-5) (u/(1-u))^(k-5) of such
-    sets that agree by accident: p = limit / mean |r| of the rejected points is about the share of wrong points that
-    agree by chance, u = `wrong` the share of wrong points expected beforehand. (Without this factor a dozen points that
-    agree, beside three errors of ten sigma, would count as an accident.) Above the `accidents` of a stage, or with less
-    than this `share` of the points, which right ones may give a wrong pose as well, the next stage follows; above those
-    of the last the outcome is `no_consensus`. A point behind a photo is rejected, unless infinitely far.
+    `sigma`: the standard deviation of a coordinate; if None that of the pair. `level`: the probability that a pair
+    without errors loses a point.
     """
 
     sigma: float | None = None
     level: float = 0.0025
-    rounds: int = 10
-    few: int = 7
-    wrong: float = 1 / 3
-    stages: tuple[Stage, ...] = (
-        Stage(GraduatedNonConvexity(), accidents=1e-4, fewest=30),
-        Stage(Ransac(hypotheses=Newton(), count=32, limit=5.0), accidents=1e-3),
-        Stage(Ransac(hypotheses=EightPoint(), count=128, confidence=0.9, limit=5.0), accidents=1e-3),
-        Stage(Ransac(hypotheses=Newton(block=64), count=1024, limit=5.0), accidents=0.05),
-        Stage(Ransac(hypotheses=FivePoint(), count=128, limit=5.0), accidents=0.05),
-    )
-    share: float = 0.3
+    stages: tuple[AbstractStage, ...] = (Plain(), Quick(), NearVertical(), Thorough())
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
@@ -77,58 +175,111 @@ class Recommended(AbstractProcedure):
             lambda n: critical_values.normal(self.level / jnp.maximum(n, 1.0)), pair.x_left.shape[0], count(pair.mask)
         )
         zero = jnp.zeros_like(limit)
-        pose, use, expected, believed = vertical(zero), fixed.mask & False, zero + jnp.inf, 0.0
+        decision = Decision(vertical(zero), fixed.mask & False, zero > 0, zero + 1)
         for stage in self.stages:
-            enough = count(use) >= self.share * count(fixed.mask)
-            needed = ~((expected <= believed) & enough) & (count(fixed.mask) >= stage.fewest)
-            pose, use, expected = self._elsewhere(stage.search, fixed, limit, pose, use, expected, needed)
-            believed = math.log(stage.accidents)
-        least = self.share if len(self.stages) == 1 else 0.0
-        convinced = (expected <= believed) & (count(use) >= least * count(fixed.mask))
-        return judged(pair, pose, use, limit).only_if(convinced, OUTCOMES.no_consensus)
+            decision = _where_open(stage, fixed, limit, decision)
+        pose, use, believed, _ = decision
+        w = normalised(linearised(fixed, pose), use)
+        weighted = _faded(pair, pose, use)
+        return judged(weighted, pose, use, limit, w).only_if(believed, OUTCOMES.no_consensus)
 
     def separate(self, points: int) -> list["Recommended"]:
-        """The stages of pairs of up to so many points as procedures of their own, for batches: each for the pairs that
+        """The stages for pairs of up to so many points as procedures of their own, for batches: each for the pairs that
         the one before left open."""
-        shares = [self.share] * (len(self.stages) - 1) + [0.0]
-        stages = zip(self.stages, shares, strict=True)
-        return [
-            dataclasses.replace(self, stages=(stage,), share=share) for stage, share in stages if stage.fewest <= points
-        ]
+        return [dataclasses.replace(self, stages=(stage,)) for stage in self.stages]
 
-    def _found(self, search: AbstractSearch, pair: Pair, limit: Float[Array, ""]):
-        pose = search.search(pair)
-        use = pair.mask & (linearised(pair, pose).squares <= limit**2)
-        found = agreeing(pair, pose, use, limit, self.rounds)
-        best, lowest, _ = one_by_one(pair, *found, limit, 2)
-        # a few small errors do not stand out in a search: the points one by one, beginning with all of them
-        few = count(pair.mask & ~best[1]) <= self.few
-        other, cost, rests = one_by_one(pair, pose, pair.mask, limit, self.rounds, few)
-        first = rests & (cost < lowest)
-        pose, use = jax.tree.map(lambda a, b: jnp.where(first, a, b), other, best)
-        return pose, use & seen(pair, pose, limit)
 
-    def _elsewhere(self, search, pair: Pair, limit, pose: RelativePose, use, expected, needed):
-        """The same by another search where it is needed: a loop of at most one round, which under vmap is entered only
-        if some pair of the batch needs it. What it works on depends on the round, or XLA would compute it anyway."""
+def settled(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> tuple[RelativePose, Use]:
+    """The pose and the points that agree with it, from a pose near the right one."""
+    use = pair.mask & (squares(pair, pose) <= limit**2)
+    found = agreeing(pair, pose, use, limit, ROUNDS)
+    best, lowest, _ = one_by_one(pair, *found, limit, 2)
+    # a few small errors do not stand out in a search: the points one by one, beginning with all of them
+    few = count(pair.mask & ~best[1]) <= FEW
+    other, cost, rests = one_by_one(pair, pose, pair.mask, limit, ROUNDS, few)
+    first = rests & (cost < lowest)
+    pose, use = jax.tree.map(lambda a, b: jnp.where(first, a, b), other, best)
+    return pose, use & seen(pair, pose, limit)
 
-        def again(state):
-            needed, *found = state
-            masked = cleaned(pair.with_mask(pair.mask & needed))[0]
-            pose, use = self._found(search, masked, limit)
-            new = [pose, use, self._accidents(pair, pose, use, limit)]
-            return needed & False, *jax.tree.map(lambda a, b: jnp.where(needed, a, b), new, found)
 
-        return while_loop(lambda state: state[0], again, (needed, pose, use, expected), pair.focal_left)[1:]
+def _from_vertical(pair: Pair, steps: int) -> RelativePose:
+    """All points by least squares."""
+    start = vertical(jnp.zeros_like(pair.focal_left))
+    return lax.fori_loop(0, steps, lambda _, pose: improved(pair, pose, pair.mask), start)
 
-    def _accidents(self, pair: Pair, pose: RelativePose, use, limit) -> Float[Array, ""]:
-        """Logarithm of the expected number."""
-        linear, mask = linearised(pair, pose), pair.mask
-        use = use & (linear.squares <= limit**2) & in_front(pair, pose)
-        n, k = count(mask), count(use)
-        wrong = mask & ~use
-        mean = total(jnp.where(wrong, jnp.sqrt(linear.squares), 0.0)) / jnp.maximum(count(wrong), 1.0)
-        chance = limit / jnp.maximum(mean, 2 * limit)
-        choices = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
-        odds = math.log(self.wrong / (1 - self.wrong))
-        return jnp.where(k > 5, choices + (k - 5) * (jnp.log(chance) + odds), jnp.inf)
+
+def _rescaled(pair: Pair, scale: Float[Array, ""]) -> Pair:
+    """The pair with so many times the standard deviations."""
+    sigma = jnp.where(pair.mask, pair.sigma * scale, 1.0)
+    return Pair(*pair.coordinates, sigma, pair.mask, pair.focal_left, pair.focal_right)
+
+
+def _faded(pair: Pair, pose: RelativePose, use: Use) -> Pair:
+    """The pair with weights that fade with the distance from a robust pose where the noise of the points in use is not
+    normal: where the mean fourth power of their residuals tells it by more than chance. (Geman and McClure's weights.)
+
+    Elsewhere the pair as it is: least squares are then best, and every point that is kept counts fully.
+    """
+    fixed = lax.stop_gradient(pair)
+    k = jnp.maximum(count(use), 1.0)
+    s = jnp.where(use, squares(fixed, pose), 0.0)
+    mean, fourth = total(s) / k, total(s * s) / k
+    heavy = fourth > mean**2 * (3 + HEAVY * jnp.sqrt(24 / k))
+    core = lax.fori_loop(0, ROUNDS, lambda _, square: _core(s, use, square), mean)
+    fade = lambda s: jnp.where(use, 1 / (1 + s / (FADING**2 * core)) ** 2, 0.0)
+
+    def step(_, pose):
+        linear = linearised(fixed, pose)
+        return stepped(pose, linear, linear.weight * fade(linear.squares))
+
+    pose = lax.fori_loop(0, ROUNDS, step, pose)
+    factor = jnp.where(heavy & use, jnp.sqrt(1 / jnp.maximum(fade(squares(fixed, pose)), 1e-6)), 1.0)
+    return Pair(*pair.coordinates, pair.sigma * factor, pair.mask, pair.focal_left, pair.focal_right)
+
+
+def _core(s: Float[Array, "point"], use: Use, square: Float[Array, ""]) -> Float[Array, ""]:
+    """The mean square of normal noise, from the points within CORE standard deviations of a first value for it."""
+    near = use & (s <= CORE**2 * square)
+    return total(jnp.where(near, s, 0.0)) / jnp.maximum(count(near), 1.0) / WITHIN_CORE
+
+
+def _untouched(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether all points agree: the global test, every |w|, and every point in front of both photos."""
+    linear = linearised(pair, pose)
+    within = normalised(linear, pair.mask) <= limit
+    agree = count(pair.mask & within & seen(pair, pose, limit)) == count(pair.mask)
+    misfit = total(jnp.where(pair.mask, linear.squares, 0.0))
+    return agree & (misfit <= evidence.chi_squared_limit(DEVIATIONS, count(pair.mask) - 5))
+
+
+def _believed_if_it_fits(
+    pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""], share: float, accidents: float
+) -> Decision:
+    """The decision for a pose of a quick search, which may have missed a better one.
+
+    Points that agree with a wrong pose, as those of one depth do, lie about it as far as the limit reaches, and fail the
+    global test. Others agree by chance with a probability of about limit / mean |r|.
+    """
+    n, k = count(pair.mask), count(use)
+    s = squares(pair, pose)
+    misfit = total(jnp.where(use, s, 0.0))
+    fits = (misfit <= evidence.chi_squared_limit(DEVIATIONS, k - 5)) & (k >= share * n) & (k > 5)
+    out = pair.mask & ~use
+    mean = total(jnp.where(out, jnp.sqrt(s), 0.0)) / jnp.maximum(count(out), 1.0)
+    chance = limit / jnp.maximum(mean, 2 * limit)
+    certain = evidence.accidents(chance, n, k) <= math.log(accidents)
+    untouched = (count(out) == 0) & _untouched(pair, pose, limit)
+    return Decision(pose, use, (fits & certain) | untouched, jnp.ones_like(limit))
+
+
+def _where_open(stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision) -> Decision:
+    """The decision of a stage where there is none yet: a loop of at most one round, which under vmap is entered only
+    if some pair of the batch needs it. What it works on depends on the round, or XLA would compute it anyway."""
+
+    def decide(state):
+        open_, decision = state
+        masked = cleaned(pair.with_mask(pair.mask & open_))[0]
+        new = stage(masked, limit)
+        return open_ & False, jax.tree.map(lambda a, b: jnp.where(open_, a, b), new, decision)
+
+    return while_loop(lambda state: state[0], decide, (~before.believed, before), pair.focal_left)[1]

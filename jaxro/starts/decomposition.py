@@ -49,7 +49,7 @@ def best_pose(
 def _decompose(essential: Square) -> tuple[Float[Array, "2 3 3 problem"], Three]:
     e = _scaled(essential, 2.0)
     # cof(E) is b times a row, plus little where E is measured; squaring leaves the singular vector of the base alone
-    c = _cofactors(e)
+    c = cofactors(e)
     m = jnp.sum(c[:, None] * c[None], axis=2)
     m = lax.fori_loop(0, SQUARINGS, lambda _, m: _scaled(jnp.sum(m[:, None] * m[None], axis=2), 1.0), m)
     length = jnp.sum(m * m, axis=1)
@@ -88,12 +88,12 @@ def _in_front(rotation: Square, base: Three, left, right, mask):
 
 def _polar_step(_, m: Float[Array, "3 3 2 problem"]) -> Float[Array, "3 3 2 problem"]:
     """Newton's iteration for the orthogonal polar factor: M <- (M + M⁻ᵀ)/2, M⁻ᵀ = cof(M)/det(M)."""
-    c = _cofactors(m)
+    c = cofactors(m)
     determinant = jnp.sum(m[0] * c[0], axis=0)
     return (m + c / jnp.maximum(determinant, 1e-30)[None, None]) / 2
 
 
-def _cofactors(m: Float[Array, "3 3 ..."]) -> Float[Array, "3 3 ..."]:
+def cofactors(m: Float[Array, "3 3 ..."]) -> Float[Array, "3 3 ..."]:
     """cof(M): its rows are the cross products of the rows of M."""
     columns = jnp.swapaxes(m, 0, 1)
     after, before = (

@@ -50,9 +50,9 @@ def five_point(
 
 def _solve(steps: int, left: Float[Array, "5 3 problem"], right: Float[Array, "5 3 problem"]):
     basis = null_space((left[:, :, None] * right[:, None, :]).reshape(5, 9, -1)).reshape(4, 3, 3, -1)
-    matrix = _elimination(_constraints(basis))
-    z, w, real = _real_roots(_determinant(matrix))
-    solutions = _polished(basis, _coefficients(matrix, z, w), steps)
+    matrix = _elimination(constraints(basis))
+    z, w, real = _real_roots(determinant(matrix))
+    solutions = _polished(basis, essential_coefficients(matrix, z, w), steps)
     essentials = jnp.sum(basis[:, :, :, None] * solutions[:, None, None], axis=0)
     return essentials * jnp.sqrt(2.0), real
 
@@ -60,7 +60,7 @@ def _solve(steps: int, left: Float[Array, "5 3 problem"], right: Float[Array, "5
 _exact, _rough = (problems_last(partial(_solve, steps)) for steps in (POLISHING, 0))
 
 
-def _constraints(basis: Float[Array, "4 3 3 problem"]) -> Float[Array, "10 20 problem"]:
+def constraints(basis: Float[Array, "4 3 3 problem"]) -> Float[Array, "10 20 problem"]:
     """The coefficients of the ten cubics (nine of the trace equation, one of the determinant) in the monomials."""
     one = jnp.stack([basis[i] for i, _ in SQUARES])
     two = jnp.stack([basis[j] for _, j in SQUARES])
@@ -109,7 +109,7 @@ def _times(p: Float[Array, "3 n problem"], q: Float[Array, "3 m problem"]) -> Fl
     return jnp.sum(shifted, axis=1)
 
 
-def _determinant(b: Float[Array, "3 3 5 problem"]) -> Float[Array, "11 problem"]:
+def determinant(b: Float[Array, "3 3 5 problem"]) -> Float[Array, "11 problem"]:
     """det B(z), ascending powers, largest coefficient 1."""
     x1, x2, y1, y2 = (jnp.concatenate([b[i:, k, :4], b[:i, k, :4]]) for k in (0, 1) for i in (1, 2))
     c = jnp.sum(_times(b[:, 2], _times(x1, y2) - _times(x2, y1)), axis=0)
@@ -185,7 +185,7 @@ def _risen(roots: Float[Array, "2 n problem"], polynomial):
     return jnp.where(found, x, better), found
 
 
-def _coefficients(b: Float[Array, "3 3 5 problem"], z: Float[Array, "10 problem"], w: Float[Array, "10 problem"]):
+def essential_coefficients(b: Float[Array, "3 3 5 problem"], z: Float[Array, "10 problem"], w: Float[Array, "10 problem"]):
     """(x, y, z, w) of every root: the null vector of B, the longest cross product of two of its rows."""
 
     def value(c):

@@ -16,11 +16,8 @@ def cross(a: Array, b: Array, axis: int = 0) -> Array:
     return jnp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=axis)
 
 
-def problems_last(solve: Callable) -> Callable:
-    """The one-problem function of a `solve` whose arrays all carry a problem axis at the end.
-
-    However deep the `vmap` outside, it only makes that last axis longer.
-    """
+def merging_last(solve: Callable) -> Callable:
+    """A `solve` whose arrays all carry a problem axis at the end; a `vmap` outside only makes that axis longer."""
 
     @custom_vmap
     def many(*arrays):
@@ -37,6 +34,16 @@ def problems_last(solve: Callable) -> Callable:
             many(*merged),
         )
         return split, jax.tree.map(lambda _: True, split)
+
+    return many
+
+
+def problems_last(solve: Callable) -> Callable:
+    """The one-problem function of a `solve` whose arrays all carry a problem axis at the end.
+
+    However deep the `vmap` outside, it only makes that last axis longer.
+    """
+    many = merging_last(solve)
 
     def one(*arrays):
         return jax.tree.map(lambda a: a[..., 0], many(*(a[..., None] for a in arrays)))

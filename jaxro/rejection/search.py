@@ -1,0 +1,271 @@
+"""A search for the orientation that most points agree with, photos in any position, most points wrong if need be.
+
+Random subsets of five points are solved; each of their orientations is scored by the truncated cost
+
+    Σ min((r / sigma)², limit²)
+
+(MSAC, Torr and Zisserman 2000), first on some JUDGES of the points, the best on all. The best of each block of subsets is
+improved on the points near it (Chum, Matas and Kittler 2003) and takes the place of the best so far if it costs less.
+The search ends when a better orientation, of a larger share p of the points, would have been met with the probability
+`confidence`: after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
+
+Right matches that lie near each other in one photo lie near each other in the other one. Every second block therefore
+draws from the points whose neighbours agree best. This changes only the order in which orientations are met: the score
+knows nothing of it, and these blocks do not count for the confidence.
+"""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from .. import coplanarity, rotations as rot
+from ..conditions import linearised
+from ..elements import RelativePose, vertical
+from ..pairs import Pair
+from ..programs import while_loop
+from ..reductions import count, total
+from . import five_points
+from .hypotheses import moved_up, squares, subsets
+from .robust import stepped
+
+LUCK = 2.0
+"""Subsets of right points alone for one whose orientation is near enough: the others are too weak, or lose their root."""
+
+PER_SUBSET = 2
+"""Orientations that are scored, at most, for each subset on the average of a block."""
+
+GUIDED = 64
+"""Blocks of which every second one is drawn from the points whose neighbours agree."""
+
+FRONTS = 5
+"""Halvings of the points to those whose neighbours agree best."""
+
+SMALLEST_FRONT = 12
+NEIGHBOURLY = 40
+"""Points from which their neighbours say something."""
+
+NEIGHBOURS = 1024
+"""Points that are looked at as neighbours, at most."""
+
+CLOSE = 1.5
+"""Distance of a neighbour in units of the mean distance between points."""
+
+
+class Found(NamedTuple):
+    """The best orientation and its score; blocks of subsets so far, subsets that count, and how many are enough.
+
+    `agreed` and `asked`: of the orientations that lost clearly, how many points agreed with them, of how many.
+    """
+
+    pose: RelativePose
+    score: Float[Array, ""]
+    blocks: Int[Array, ""]
+    counted: Float[Array, ""]
+    enough: Float[Array, ""]
+    agreed: Float[Array, ""]
+    asked: Float[Array, ""]
+
+
+class Search(eqx.Module):
+    """How to search. `limit`: multiple of sigma up to which a point agrees; `margin`: the factor of it for orientations
+    of five points, which carry the errors of these. `block` subsets are solved together, at most `count`; `judges`
+    points score them first, and the `finalists` best are scored by all points. `steps` of Gauss-Newton improve the best
+    of a block, the first on points within `margin` times the limit."""
+
+    count: int = 1 << 18
+    block: int = 256
+    confidence: float = 0.99
+    limit: float = 3.3
+    margin: float = math.sqrt(2)
+    judges: int = 96
+    finalists: int = 16
+    steps: int = 3
+    seed: int = 0
+
+    def begin(self, pair: Pair, pose: RelativePose) -> Found:
+        """A search that knows one orientation."""
+        zero = jnp.zeros_like(pair.focal_left)
+        return Found(
+            pose=pose,
+            score=score(pair, pose, self.limit),
+            blocks=zero.astype(int),
+            counted=zero,
+            enough=self.enough(pair, pose),
+            agreed=zero,
+            asked=zero,
+        )
+
+    def run(self, pair: Pair, found: Found, most: int | None = None) -> Found:
+        """The search, continued until it is enough, or `most` blocks have been searched."""
+        most = -(-self.count // self.block) if most is None else most
+        rows = moved_up(pair)
+        order = neighbourly(rows, count(pair.mask)) if most > 1 and len(rows) >= NEIGHBOURLY else None
+
+        def more(found: Found) -> Bool[Array, ""]:
+            return (found.blocks < most) & (found.counted < found.enough)
+
+        return while_loop(more, lambda found: self._searched(pair, rows, order, found), found, pair.focal_left)
+
+    def enough(self, pair: Pair, pose: RelativePose) -> Float[Array, ""]:
+        """How many subsets are enough, if the share of points that agree with this pose is that of the right ones."""
+        agree = count(pair.mask & (squares(pair, pose) <= self.limit**2))
+        of = count(pair.mask)
+        share = math.prod(jnp.maximum(agree - k, 0.0) / jnp.maximum(of - k, 1.0) for k in range(5))
+        share = jnp.clip(share / LUCK, 1e-12, 1 - 1e-12)
+        return jnp.where(of >= 6, math.log1p(-self.confidence) / jnp.log1p(-share), 0.0)
+
+    def _searched(self, pair: Pair, rows: Float[Array, "point 4"], order, found: Found) -> Found:
+        """After one more block."""
+        of = count(pair.mask)
+        poses, exist = self._hypotheses(pair, rows, order, found.blocks)
+        first = _judged(pair, rows, of, poses, self.judges, self.limit * self.margin)
+        first_score = jnp.where(exist, first.cost, jnp.inf)
+        lost = exist & (first.agree < 0.5 * jnp.max(jnp.where(exist, first.agree, 0.0)))
+        _, chosen = lax.top_k(-first_score.astype(jnp.float32), min(self.finalists, first_score.shape[0]))
+        finalists = jax.tree.map(lambda a: a[chosen], poses)
+        scores = jax.vmap(lambda pose: score(pair, pose, self.limit * self.margin))(finalists)
+        scores = jnp.where(exist[chosen], scores, jnp.inf)
+        best = jax.tree.map(lambda a: a[jnp.argmin(scores)], finalists)
+        new = self._improved(pair, best)
+        new_score = jnp.where(jnp.any(exist), score(pair, new, self.limit), jnp.inf)
+        better = new_score < found.score
+        pose = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, found.pose)
+        counts = jnp.where(self._guided(found.blocks) & (order is not None), 0.0, 1.0)
+        return Found(
+            pose=pose,
+            score=jnp.where(better, new_score, found.score),
+            blocks=found.blocks + 1,
+            counted=found.counted + counts * self.block,
+            enough=self.enough(pair, pose),
+            agreed=found.agreed + total(jnp.where(lost, first.agree - 5 * first.asked / jnp.maximum(of, 1.0), 0.0)),
+            asked=found.asked + total(jnp.where(lost, first.asked, 0.0)),
+        )
+
+    def _guided(self, block: Int[Array, ""]) -> Bool[Array, ""]:
+        return (block < GUIDED) & (block % 2 == 0)
+
+    def _hypotheses(self, pair: Pair, rows, order, block) -> tuple[RelativePose, Bool[Array, "hypothesis"]]:
+        """The orientations of a block of subsets."""
+        of = count(pair.mask)
+        uniform = jax.random.uniform(jax.random.fold_in(jax.random.key(self.seed), block), (5, self.block), jnp.float32)
+        if order is None:
+            places = subsets(uniform, of)
+        else:
+            front = jnp.maximum(of * 0.5 ** (1 + (block // 2) % FRONTS).astype(of.dtype), SMALLEST_FRONT)
+            guided = self._guided(block)
+            places = subsets(uniform, jnp.where(guided, jnp.minimum(jnp.ceil(front), of), of))
+            places = jnp.where(guided, order.at[places].get(mode="clip"), places)
+        few = rows.at[places].get(mode="clip")
+        x1, y1, x2, y2 = (few[..., k] for k in range(4))
+        minus = -jnp.ones_like(x1)
+        left = jnp.stack([x1 / pair.focal_left, y1 / pair.focal_left, minus], axis=1)
+        right = jnp.stack([x2 / pair.focal_right, y2 / pair.focal_right, minus], axis=1)
+        return _gathered(five_points.solve(left, right), PER_SUBSET * self.block)
+
+    def _improved(self, pair: Pair, pose: RelativePose) -> RelativePose:
+        """Gauss-Newton on the points within a limit that narrows."""
+
+        def step(k, pose):
+            wide = self.limit * jnp.where(k < self.steps - 1, self.margin, 1.0)
+            linear = linearised(pair, pose)
+            return stepped(pose, linear, jnp.where(linear.squares <= wide**2, linear.weight, 0.0))
+
+        return lax.fori_loop(0, self.steps, step, pose)
+
+
+class Judgement(NamedTuple):
+    """Of each orientation the truncated cost of some points, how many of them agree, and of how many."""
+
+    cost: Float[Array, "hypothesis"]
+    agree: Float[Array, "hypothesis"]
+    asked: Float[Array, "hypothesis"]
+
+
+def _gathered(solutions: five_points.Solutions, most: int) -> tuple[RelativePose, Bool[Array, "hypothesis"]]:
+    """The solutions that exist, one behind the other on `most` places, as poses."""
+    exist = solutions.exist.reshape(-1)
+    place = jnp.where(exist, jnp.cumsum(exist.astype(int)) - 1, most)
+    source = jnp.zeros(most, int).at[place].set(jnp.arange(exist.shape[0]), mode="drop")
+    flat = lambda a: a.reshape(*a.shape[:-2], -1)
+    rotation = flat(jnp.moveaxis(solutions.rotation, 0, 2))
+    base = flat(jnp.moveaxis(solutions.base, 0, 1))
+    rotation, base = rotation[:, :, source], base[:, source]
+    pose = RelativePose(*rot.to_quaternion(rot.as_matrix(rotation)), base[0], base[1], base[2])
+    there = jnp.arange(most) < jnp.sum(exist.astype(int))
+    fine = there & jnp.isfinite(sum(jax.tree.leaves(pose)))
+    one = jnp.ones_like(pose.qw)
+    return jax.tree.map(lambda a: jnp.where(fine, a, one), pose).normalised(), fine
+
+
+def _judged(pair: Pair, rows, of, poses: RelativePose, judges: int, limit: float) -> Judgement:
+    """What points evenly taken of all say of every orientation, in single precision."""
+    size = min(judges, rows.shape[0])
+    number = jnp.arange(size)
+    place = jnp.where(of > size, jnp.floor(number * (of / size)).astype(int), number)
+    there = (number < of).astype(jnp.float32)[:, None]
+    single = lambda a: a.astype(jnp.float32)
+    points = single(rows.at[place].get(mode="clip"))
+    sigma = moved_up_sigma(pair).at[place].get(mode="clip")
+    bound = single((limit * sigma) ** 2)[:, None]
+    rotation, base = jax.tree.map(single, poses.relative())
+    f = coplanarity.fundamental_matrix(rotation, base, single(pair.focal_left), single(pair.focal_right))
+
+    def one(f, point, use):
+        g, square, _ = coplanarity.linearised(f, point, use)
+        return g * g / square
+
+    each = jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, 0))
+    r2 = each(f, tuple(points[:, k] for k in range(4)), there[:, 0] > 0)
+    share = jnp.minimum(r2 / bound, 1.0)
+    agree = jnp.where(r2 <= bound, there, 0.0)
+    double = lambda a: a.astype(pair.focal_left.dtype)
+    asked = jnp.broadcast_to(jnp.sum(there), share.shape[1:])
+    return Judgement(*map(double, (jnp.sum(share * there, axis=0), jnp.sum(agree, axis=0), asked)))
+
+
+def neighbourly(rows: Float[Array, "point 4"], of: Float[Array, ""]) -> Int[Array, "point"]:
+    """The places of the points, first those whose neighbours in the left photo are neighbours in the right one, too."""
+    size = rows.shape[0]
+    single = rows.astype(jnp.float32)
+    there = (jnp.arange(size) < of).astype(jnp.float32)
+    step = -(-size // NEIGHBOURS)
+    others, taken = single[::step], there[::step]
+
+    def spread(x, y):
+        mean = lambda a: jnp.sum(a * there) / jnp.maximum(jnp.sum(there), 1.0)
+        variance = mean(x * x) - mean(x) ** 2 + mean(y * y) - mean(y) ** 2
+        return jnp.maximum(variance, 1e-12) * 4 / jnp.maximum(jnp.sum(taken), 1.0)
+
+    near_left, near_right = (CLOSE**2 * spread(single[:, k], single[:, k + 1]) for k in (0, 2))
+
+    def agreement(row):
+        left = (others[:, 0] - row[0]) ** 2 + (others[:, 1] - row[1]) ** 2
+        right = (others[:, 2] - row[2]) ** 2 + (others[:, 3] - row[3]) ** 2
+        near = taken / (1 + left / near_left) ** 2
+        both = near / (1 + right / near_right) ** 2
+        return jnp.sum(both) / jnp.maximum(jnp.sum(near), 1e-6)
+
+    value = jnp.where(there > 0, jax.vmap(agreement)(single), -1.0)
+    return jnp.argsort(-value)
+
+
+def moved_up_sigma(pair: Pair) -> Float[Array, "point"]:
+    """The standard deviations of the points that take part, moved before all others."""
+    place = jnp.where(pair.mask, jnp.cumsum(pair.mask) - 1, pair.mask.shape[0])
+    return jnp.ones_like(pair.sigma).at[place].set(pair.sigma, mode="drop")
+
+
+def score(pair: Pair, pose: RelativePose, limit: float) -> Float[Array, ""]:
+    """Σ min((r / sigma)², limit²), infinite where it is no number."""
+    value = total(jnp.minimum(squares(pair, pose), limit**2))
+    return jnp.where(jnp.isfinite(value), value, jnp.inf)
+
+
+def nothing(pair: Pair) -> RelativePose:
+    """The pose to begin with where nothing is known."""
+    return vertical(jnp.zeros_like(pair.focal_left))
