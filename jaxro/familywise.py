@@ -84,8 +84,8 @@ def largest_tau(level: ArrayLike, normalised: Normalised) -> Float[Array, ""]:
 
 
 def effective_number(normalised: Normalised, limit: ArrayLike, estimated: bool = False) -> Float[Array, ""]:
-    """How many independent tests reject as often as those of the tested points of a pair of at most MOST points do, each
-    at the same |w| = limit (|tau| if `estimated`)."""
+    """How many independent tests reject as often as those of the tested points of a pair, each at |w| = limit (|tau| if
+    `estimated`); of at most MOST points."""
     drawn = _drawn_tau if estimated else _drawn_w
     return _number(_few(normalised), jnp.asarray(limit, float), drawn)
 

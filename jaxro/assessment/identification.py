@@ -1,7 +1,7 @@
 """Identification: not only that an error is found, but in which point.
 
-An error that moves w_i by delta moves the w of the other points by rho_ij delta. Point i is *identified* by a test if it
-is the one point that is named (`rejection.undecided`): |w_i| exceeds the limit, no other |w| is larger, and no other
+An error that moves w_i by delta moves the w of the other points by rho_ij delta. Point i is *identified* by a test if
+it is the one point that is named (`rejection.undecided`): |w_i| exceeds the limit, no other |w| is larger, and no other
 point explains the misfit as well. With x = w_i and v_j normal, independent of x, w_j = rho x + sqrt(1 - rho²) v_j, so
 that for a positive error all of this is
 
@@ -10,8 +10,8 @@ that for a positive error all of this is
 
 k the normal value of `doubt`. With X the largest right-hand side, P(i is identified) is the mean of Φ(delta - X) over
 the v. The *minimal identifiable error* is that of which the mean is the wanted power, as the minimal detectable error
-(Baarda 1968) is that of which P(|w_i| > limit) is. With doubt = 1 it is the minimal identifiable bias of the largest |w|
-(Teunissen 2018; Rofatto et al. 2020). It is infinite where |rho| = 1.
+(Baarda 1968) is that of which P(|w_i| > limit) is. With doubt = 1 it is the minimal identifiable bias of the largest
+|w| (Teunissen 2018; Rofatto et al. 2020). It is infinite where |rho| = 1.
 
 All is of first order, at the measured coordinates, with a known sigma0. What depends on several residuals at once is
 simulated from a key, with the same draws for all points.

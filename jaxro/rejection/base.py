@@ -44,8 +44,8 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "deviation is too small. Use the procedure `recommended`."
     )
     undecided = (
-        "One more point is wrong, and the others do not tell which: leaving out any one of those that are named explains "
-        "the misfit as well, so that none of them is rejected. Measure them again, or more points beside them."
+        "One more point is wrong, and the others do not tell which: leaving out any one of those that are named "
+        "explains the misfit as well, so that none of them is rejected. Measure them again, or more points beside them."
     )
     not_oriented = "The points that were kept do not orient the pair; see the result of its orientation."
 

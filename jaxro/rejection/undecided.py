@@ -7,8 +7,8 @@ Let i have the largest |w|. If the error is in j instead, the adjustment without
 is normal with standard deviation 1 whatever the size of the error. So j is named together with i unless |w_i|j| exceeds
 the two-sided normal value of `doubt`: a wrong j is passed over in favour of one given other point with this probability
 (of the tau distribution with one degree of freedom less where sigma0 is estimated, from the residuals without j). This
-is a likelihood ratio: Σ r² grows by w_i|j² when i is put back into the adjustment without both. Points with |rho_ij| = 1
-are always named together; only i is named where the others are little correlated with it, or its error is large.
+is a likelihood ratio: Σ r² grows by w_i|j² when i is put back into the adjustment without both. Points with
+|rho_ij| = 1 are always named together; only i is named where the others are little correlated with it, or its error is large.
 """
 
 import jax.numpy as jnp
@@ -49,9 +49,7 @@ def explaining(normalised: Normalised, point: Int[Array, ""], doubt: float = DOU
     return normalised.tested & (near | own)
 
 
-def undecided(
-    pair: Pair, pose: RelativePose, use: Use, rejected: Use | None = None, doubt: float = DOUBT
-) -> Use:
+def undecided(pair: Pair, pose: RelativePose, use: Use, rejected: Use | None = None, doubt: float = DOUBT) -> Use:
     """The points of which some are wrong, though nothing tells which, after a verdict that all but `use` are: every
     rejected point that could change places with one of those in use, and these. Empty where all is decided.
 
