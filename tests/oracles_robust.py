@@ -64,7 +64,7 @@ def reweighted(points, focal, sigma, weight, limit, rounds=200, convex=5, full=1
 
 def snooping(points, focal, sigma, level, estimated=False, least=6, doubt=0.01):
     """The points in the order in which the largest |w| (or tau, with sigma0) goes while it exceeds its quantile, and
-    the points of which one is wrong at the end: those without which the largest |w| would not exceed that of `doubt`."""
+    the points of which one is wrong at the end: without those the largest |w| is below that of `doubt`."""
     used, gone = list(range(points.shape[1])), []
     while len(used) >= least:
         w = of_used(points, focal, sigma, used, estimated)

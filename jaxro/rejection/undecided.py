@@ -4,11 +4,12 @@ Let i have the largest |w|. If the error is in j instead, the adjustment without
 
     w_i|j = (w_i - rho_ij w_j) / sqrt(1 - rho_ij²),
 
-is normal with standard deviation 1 whatever the size of the error. So j is named together with i unless |w_i|j| exceeds
-the two-sided normal value of `doubt`: a wrong j is passed over in favour of one given other point with this probability
-(of the tau distribution with one degree of freedom less where sigma0 is estimated, from the residuals without j). This
-is a likelihood ratio: Σ r² grows by w_i|j² when i is put back into the adjustment without both. Points with
-|rho_ij| = 1 are always named together; only i is named where the others are little correlated with it, or its error is large.
+is normal with standard deviation 1 whatever the size of the error. So j is named together with i unless |w_i|j|
+exceeds the two-sided normal value of `doubt`: a wrong j is passed over in favour of one given other point with this
+probability (of the tau distribution with one degree of freedom less where sigma0 is estimated, from the residuals
+without j). This is a likelihood ratio: Σ r² grows by w_i|j² when i is put back into the adjustment without both.
+Points with |rho_ij| = 1 are always named together; only i is named where the others are little correlated with it, or
+its error is large.
 """
 
 import jax.numpy as jnp
