@@ -158,29 +158,25 @@ def chances(
     delta = jump * jnp.sqrt(linear.weight * known.redundancy) / jnp.asarray(sigma0)
     errors = _errors(known, key, draws)
 
-    def one(point: Int[Array, ""]) -> Chances:
+    def one(point: Int[Array, ""]) -> tuple[Float[Array, ""], ...]:
         own = jnp.arange(known.w.shape[0]) == point
         shift = known.row(point) * jnp.sum(jnp.where(own, delta, 0.0))
 
-        def outcome(w: PerPoint) -> Chances:
+        def outcome(w: PerPoint) -> tuple[Bool[Array, ""], ...]:
             w = w + shift
             largest = jnp.argmax(jnp.abs(w))
             named = explaining(known._replace(w=w), largest, doubt)
             found = jnp.max(jnp.abs(w)) > limit
             alone, among = jnp.sum(named) == 1, jnp.any(named & own)
-            return Chances(
-                correct=found & alone & among,
-                wrong=found & alone & ~among,
-                undecided=found & ~alone & among,
-                misled=found & ~alone & ~among,
-                missed=~found,
-            )
+            right, several, other = found & alone & among, found & ~alone & among, found & ~among
+            return right, other & alone, several, other & ~alone, ~found
 
         tested = jnp.any(own & known.tested)
         share = lambda happened: jnp.where(tested, jnp.mean(happened.astype(float)), 0.0)
         return jax.tree.map(share, jax.vmap(outcome)(errors))
 
-    return lax.map(one, jnp.arange(known.w.shape[0]))
+    correct, wrong, undecided, misled, missed = lax.map(one, jnp.arange(known.w.shape[0]))
+    return Chances(correct=correct, wrong=wrong, undecided=undecided, misled=misled, missed=missed)
 
 
 def _normalised(pair: Pair, orientation: Orientation) -> tuple[Pair, Normalised]:
