@@ -170,7 +170,7 @@ def test_the_minimal_identifiable_error_is_identified_with_its_power(points, tri
         noise = lambda key, error=error: simulation.planted(simulation.noisy(one, key, SIGMA), y_right=error)
         pairs = jax.vmap(noise)(jax.random.split(jax.random.key(100 + point), trials))
         kept, doubted, _, _ = jaxro.clean_batch(pairs, SNOOPING, select=rejection)
-        first = np.asarray(~kept)[:, point] & ~np.any(doubted, axis=1)
+        first = ~np.asarray(kept)[:, point] & ~np.any(np.asarray(doubted), axis=1)
         assert abs(np.mean(first) - 0.8) < (0.01 if trials > 5000 else 3.5 * np.sqrt(0.16 / trials))
 
 
