@@ -13,7 +13,9 @@ if "JAX_ENABLE_X64" not in _os.environ:
 from . import (
     budget as budget,
     coplanarity as coplanarity,
+    correlations as correlations,
     critical_values as critical_values,
+    familywise as familywise,
     height_accuracy as height_accuracy,
     height_planning as height_planning,
     heights as heights,
@@ -32,6 +34,7 @@ from . import (
     variance_components as variance_components,
 )
 from .adjustment import Adjustment as Adjustment, adjust as adjust
+from .assessment import identification as identification
 from .batch import clean_batch as clean_batch, map_batch as map_batch, orient_batch as orient_batch
 from .elements import (
     AbstractElements as AbstractElements,

@@ -159,17 +159,18 @@ def orient_ragged(
 
 class Decisions(NamedTuple):
     """What a procedure decided: of every row whether it is kept, in which round it went, and its statistic then; of
-    every pair the outcome, a number of `rejection.OUTCOMES`."""
+    every pair the outcome, a number of `rejection.OUTCOMES`; of every row whether it is `undecided`."""
 
     kept: Bool[np.ndarray, " row"]
     order: Int[np.ndarray, " row"]
     statistic: Flat
     outcome: Int[np.ndarray, " pair"]
+    undecided: Bool[np.ndarray, " row"]
 
 
 def decisions(rejection: Rejection) -> tuple[PyTree, PyTree]:
-    """The outcome of a pair; of every point (kept, order, statistic)."""
-    return rejection.outcome._value, (rejection.mask, rejection.order, rejection.statistic)
+    """The outcome of a pair; of every point (kept, order, statistic, undecided)."""
+    return rejection.outcome._value, (rejection.mask, rejection.order, rejection.statistic, rejection.undecided)
 
 
 def clean_ragged(
@@ -202,8 +203,8 @@ def clean_ragged(
             doubtful[left - 1].append(members[doubt])
     if select is not decisions:
         return out.tree
-    outcome, (kept, order, statistic) = out.tree
-    return Decisions(kept, order, statistic, outcome)
+    outcome, (kept, order, statistic, undecided) = out.tree
+    return Decisions(kept=kept, order=order, statistic=statistic, outcome=outcome, undecided=undecided)
 
 
 def _fitting(plan: Plan | None, pairs: Ragged) -> Plan:

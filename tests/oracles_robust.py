@@ -62,24 +62,49 @@ def reweighted(points, focal, sigma, weight, limit, rounds=200, convex=5, full=1
     return np.zeros(points.shape[1], bool), False
 
 
-def snooping(points, focal, sigma, level, estimated=False, least=6):
-    """The points in the order in which the largest |w| (or tau, with sigma0) goes while it exceeds its quantile."""
+def snooping(points, focal, sigma, level, estimated=False, least=6, doubt=0.01):
+    """The points in the order in which the largest |w| (or tau, with sigma0) goes while it exceeds its quantile, and
+    the points of which one is wrong at the end: without those the largest |w| is below that of `doubt`."""
     used, gone = list(range(points.shape[1])), []
-    while len(used) > least:
-        here, every = points[:, used], np.ones(len(used))
-        elements = solved(here, focal, sigma, every, np.zeros(5))
-        w, h = standardised(here, focal, sigma, every, elements)
-        f = len(used) - 5
-        limit = scipy.stats.norm.isf(level / 2)
-        if estimated:
-            w = w / np.sqrt(np.sum(linearised(here, focal, sigma, elements)[0] ** 2) / f)
-            t = scipy.stats.t.isf(level / 2, max(f - 1, 1))
-            limit = np.sqrt(f) * t / np.sqrt(f - 1 + t * t) if f > 1 else np.inf
-        w[1 - h < 1e-6] = 0
-        if np.max(w) <= limit:
+    while len(used) >= least:
+        w = of_used(points, focal, sigma, used, estimated)
+        best = used[int(np.argmax(w))]
+        if np.max(w) <= quantile(level, len(used), estimated):
             break
-        gone.append(used.pop(int(np.argmax(w))))
-    return gone
+        rest = [[k for k in used if k != j] for j in used]
+        named = [best] if len(used) > 6 else used
+        for j, others in zip(used, rest, strict=True):
+            if j != best and len(used) > 6:
+                without = of_used(points, focal, sigma, others, estimated)[others.index(best)]
+                if without <= quantile(doubt, len(others), estimated):
+                    named = [*named, j]
+        if len(named) > 1:
+            return gone, sorted(named)
+        if len(used) == least:
+            break
+        gone.append(best)
+        used.remove(best)
+    return gone, []
+
+
+def of_used(points, focal, sigma, used, estimated):
+    """|w|, or |tau|, of these points in their own adjustment."""
+    here, every = points[:, used], np.ones(len(used))
+    elements = solved(here, focal, sigma, every, np.zeros(5))
+    w, h = standardised(here, focal, sigma, every, elements)
+    if estimated:
+        w = w / np.sqrt(np.sum(linearised(here, focal, sigma, elements)[0] ** 2) / (len(used) - 5))
+    w[1 - h < 1e-6] = 0
+    return w
+
+
+def quantile(level, count, estimated):
+    """Two-sided, of w or of tau."""
+    f = count - 5
+    if not estimated:
+        return scipy.stats.norm.isf(level / 2)
+    t = scipy.stats.t.isf(level / 2, max(f - 1, 1))
+    return np.sqrt(f) * t / np.sqrt(f - 1 + t * t) if f > 1 else np.inf
 
 
 def fewest_omissions(points, focal, sigma, most, level):

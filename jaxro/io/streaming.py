@@ -132,7 +132,8 @@ class Worker:
         """Every row of the input with its verdict."""
         measured = {name: table.column(name) for name in table.column_names if name not in rows}
         order = records.where(decided["order"].astype(np.int32), ~decided["kept"])
-        verdict = {"kept": decided["kept"], "order": order, "statistic": decided["statistic"]}
+        verdict = {"kept": decided["kept"], "undecided": decided["undecided"], "order": order}
+        verdict |= {"statistic": decided["statistic"]}
         return records.table({**rows, **measured}, verdict | {"limit": decided["limit"], "q": q}, self._work.units)
 
     def _written(self, number: int, tables: dict[str, Any]) -> dict[str, int]:

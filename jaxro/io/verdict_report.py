@@ -18,6 +18,7 @@ def show(console: Console, verdicts: list[Verdict], procedure: str, unit: str) -
     console.print(f"[bold]Cleaning of {escape(of)}[/bold] by {procedure}: {rejected} of {points} points rejected")
     if rejected:
         _rejections(console, verdicts, rejected, unit)
+    _doubts(console, verdicts)
     outcomes: dict[str, list[str]] = defaultdict(list)
     for v in verdicts:
         outcomes[v.outcome].append(v.measured.name)
@@ -51,6 +52,16 @@ def _rejections(console: Console, verdicts: list[Verdict], count: int, unit: str
     console.print(rows)
     if count > MOST_ROWS:
         console.print(f"{MOST_ROWS} of {count} rejections; --out DIR writes all.")
+
+
+def _doubts(console: Console, verdicts: list[Verdict]) -> None:
+    """Of which points one is wrong, by pair."""
+    doubtful = [v for v in verdicts if v.undecided]
+    for v in doubtful[:MOST_ROWS]:
+        of = f"{v.measured.name}: " if len(verdicts) > 1 else ""
+        console.print(f"{of}wrong is one of {', '.join(v.undecided)}; nothing tells which.", markup=False)
+    if len(doubtful) > MOST_ROWS:
+        console.print(f"{MOST_ROWS} of {len(doubtful)} undecided pairs; --out DIR writes all.")
 
 
 def _evidence(value: float) -> str:

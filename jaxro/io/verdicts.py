@@ -1,10 +1,11 @@
 """What a procedure decided about each pair, and the files that say so: cleaned.csv, decisions.csv, decisions.json.
 
-* cleaned.csv: every row of the input in its order; kept or rejected, when (1: first), the statistic and its limit in
-  the round that decided, and the y-parallax q at the orientation of the points kept, of rejected points as well.
+* cleaned.csv: every row of the input in its order; kept, rejected or undecided (kept, though one of the points of its
+  pair that are so named is wrong), when (1: first), the statistic and its limit in the round that decided, and the
+  y-parallax q at the orientation of the points kept, of rejected points as well.
 * decisions.csv: every point in use in every round. Without a limit the round was an iteration and no decision.
 * decisions.json: the procedure with its tolerances; of each pair the outcome, the points in the order of rejection
-  (those of one list went together) and the elements by round.
+  (those of one list went together), the undecided points and the elements by round.
 
 What a statistic is, and its unit, says the procedure; inf: wrong by any measure.
 """
@@ -42,6 +43,7 @@ class Decision(NamedTuple):
     order: Int[Either, "point"]
     statistic: Float[Either, "point"]
     limit: Float[Either, "point"]
+    undecided: Bool[Either, "point"]
     outcome: Int[Either, ""]
 
 
@@ -53,7 +55,14 @@ def decision(found: Rejection) -> Decision:
     when = jnp.where(jnp.any(log.rejected, axis=0), jnp.argmax(log.rejected, axis=0), last)
     limit = jnp.where(when >= 0, log.limit[when], jnp.inf)
     statistic = jnp.where(unusable(found.mask, found.order), jnp.inf, found.statistic)
-    return Decision(found.mask, found.order, statistic, limit, found.outcome._value)
+    return Decision(
+        kept=found.mask,
+        order=found.order,
+        statistic=statistic,
+        limit=limit,
+        undecided=found.undecided,
+        outcome=found.outcome._value,
+    )
 
 
 def unusable(kept: Either, order: Either) -> Either:
@@ -101,6 +110,11 @@ class Verdict:
         out = np.flatnonzero(~np.asarray(self.decision.kept))
         return out[np.argsort(order[out], kind="stable")].tolist()
 
+    @cached_property
+    def undecided(self) -> list[str]:
+        """The names of the points of which one is wrong, none of them rejected."""
+        return [self.measured.points[i] for i in np.flatnonzero(self.decision.undecided)]
+
     def rounds(self) -> Iterator[tuple]:
         """(statistic, limit, rejected, parallax, elements) of every round, if they were asked for."""
         if self.log is not None:
@@ -142,9 +156,9 @@ def _point_rows(verdicts: list[Verdict], unit: str) -> list[list[Any]]:
     rows: list[tuple[int, list[Any]]] = []
     for v in verdicts:
         m, d = v.measured, v.decision
-        columns = (m.lines, m.points, m.rows, d.kept, d.order, d.statistic, d.limit, v.parallax)
-        for line, name, row, kept, order, statistic, limit, q in zip(*map(list, columns), strict=True):
-            verdict = ["kept", ""] if kept else ["rejected", int(order)]
+        columns = (m.lines, m.points, m.rows, d.kept, d.undecided, d.order, d.statistic, d.limit, v.parallax)
+        for line, name, row, kept, undecided, order, statistic, limit, q in zip(*map(list, columns), strict=True):
+            verdict = ["undecided" if undecided else "kept", ""] if kept else ["rejected", int(order)]
             rows.append((line, [m.name, name, *row, *verdict, _value(statistic), float(limit), float(q)]))
     return [header, *(row for _, row in sorted(rows, key=lambda entry: entry[0]))]
 
@@ -175,6 +189,7 @@ def _summary(v: Verdict) -> dict[str, Any]:
         "points": len(v.measured.points),
         "rejected": len(v.rejected),
         "order": list(together.values()),
+        "undecided": v.undecided,
         "elements": [
             {"round": number, **dict(zip(names, np.rad2deg(elements).tolist(), strict=True))}
             for number, (*_, elements) in enumerate(v.rounds(), 1)

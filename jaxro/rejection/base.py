@@ -43,6 +43,10 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "No choice of so few omissions as are tried passes the global test: more points are wrong, or the standard "
         "deviation is too small. Use the procedure `recommended`."
     )
+    undecided = (
+        "One more point is wrong, and the others do not tell which: leaving out any one of those that are named "
+        "explains the misfit as well, so that none of them is rejected. Measure them again, or more points beside them."
+    )
     not_oriented = "The points that were kept do not orient the pair; see the result of its orientation."
 
 
@@ -68,7 +72,7 @@ class Rejection(eqx.Module):
 
     `mask`: points kept. `order`: 1 for the points rejected first, 2 for the next, ...; 0 for those kept.
     `statistic`: of every point, in the round that rejected it or else in the last one. `orientation`: of the points
-    kept.
+    kept. `undecided`: points of which one is wrong, though nothing tells which; they are kept.
     """
 
     mask: Bool[Array, "*pairs point"]
@@ -77,11 +81,20 @@ class Rejection(eqx.Module):
     log: Log
     orientation: Orientation
     outcome: OUTCOMES
+    undecided: Bool[Array, "*pairs point"]
 
     def only_if(self, fine: Bool[Array, ""], otherwise: OUTCOMES) -> "Rejection":
         """The same decision, with another outcome where it is not fine and there was something to test."""
         outcome = OUTCOMES.where(fine | (self.outcome == OUTCOMES.nothing_to_test), self.outcome, otherwise)
-        return Rejection(self.mask, self.order, self.statistic, self.log, self.orientation, outcome)
+        return Rejection(
+            mask=self.mask,
+            order=self.order,
+            statistic=self.statistic,
+            log=self.log,
+            orientation=self.orientation,
+            outcome=outcome,
+            undecided=self.undecided,
+        )
 
 
 class AbstractProcedure(eqx.Module):
@@ -242,11 +255,28 @@ def independent(pose: RelativePose) -> Float[Array, "*pairs 5"]:
     return values(convert(pose, IndependentElements, jnp.ones_like(pose.bx)))
 
 
-def ended(history: History, orientation: Orientation, outcome: OUTCOMES) -> Rejection:
-    """The verdict; `not_oriented` where the procedure finished with points that do not orient the pair."""
-    failed = (outcome == OUTCOMES.finished) & ~is_usable(orientation.result)
-    outcome = OUTCOMES.where(failed, OUTCOMES.not_oriented, outcome)
-    return Rejection(history.mask, history.order, history.statistic, history.log, orientation, outcome)
+def ended(
+    history: History,
+    orientation: Orientation,
+    outcome: OUTCOMES,
+    undecided: Bool[Array, "point"] | None = None,
+) -> Rejection:
+    """The verdict. Where the procedure finished, `not_oriented` if the points kept do not orient the pair, and
+    `undecided` if there are such points."""
+    none = jnp.zeros_like(history.mask)
+    fine = outcome == OUTCOMES.finished
+    named = none if undecided is None else undecided & fine
+    outcome = OUTCOMES.where(count(named) > 0, OUTCOMES.undecided, outcome)
+    outcome = OUTCOMES.where(fine & ~is_usable(orientation.result), OUTCOMES.not_oriented, outcome)
+    return Rejection(
+        mask=history.mask,
+        order=history.order,
+        statistic=history.statistic,
+        log=history.log,
+        orientation=orientation,
+        outcome=outcome,
+        undecided=named,
+    )
 
 
 def finished(pair: Pair) -> OUTCOMES:

@@ -25,12 +25,13 @@ class TwoStage(AbstractProcedure):
         log = Log(*(jnp.concatenate([a, b]) for a, b in zip(_parts(one.log), _parts(two.log), strict=True)))
         unfinished = one.outcome == OUTCOMES.operator_needed
         return Rejection(
-            two.mask,
-            jnp.where(later, two.order + jnp.max(one.order), one.order),
-            jnp.where(one.order > 0, one.statistic, two.statistic),
-            log,
-            two.orientation,
-            OUTCOMES.where(unfinished, one.outcome, two.outcome),
+            mask=two.mask,
+            order=jnp.where(later, two.order + jnp.max(one.order), one.order),
+            statistic=jnp.where(one.order > 0, one.statistic, two.statistic),
+            log=log,
+            orientation=two.orientation,
+            outcome=OUTCOMES.where(unfinished, one.outcome, two.outcome),
+            undecided=two.undecided,
         )
 
 

@@ -1,0 +1,1 @@
+"""What an oriented pair could tell: assessment beyond its residuals."""
