@@ -22,13 +22,14 @@ class Inspection(NamedTuple):
     mean square distance of the points from the condition, to first order, over the left focal length. `spread`: that of
     the left points from the principal point, over the same. `angle`: root mean square sine of the angle between p1 and
     R p2, that is without a base; `parallax`: the same in units of the standard deviation of a coordinate seen from the
-    photos, sigma / f."""
+    photos, sigma / f. `sigma`: root mean square of the sigmas."""
 
     in_front: Float[Array, ""]
     distance: Float[Array, ""]
     spread: Float[Array, ""]
     angle: Float[Array, ""]
     parallax: Float[Array, ""]
+    sigma: Float[Array, ""]
 
 
 def inspect(pair: Pair, pose: RelativePose) -> Inspection:
@@ -46,10 +47,10 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
         # XLA gives a quotient that is used twice a loop of its own, but not a selection of it
         ratio = jnp.where(use, w2 / (length * rot.dot(second, second) * sigma**2), 0.0)
         radius = length - pair.focal_left**2
-        terms = jnp.ones_like(g), left + right, g * g / square, radius, ratio * sigma**2, ratio * seen**2
+        terms = jnp.ones_like(g), left + right, g * g / square, radius, ratio * sigma**2, ratio * seen**2, sigma**2
         return tuple(jnp.where(use, term, 0.0) for term in terms)
 
     number, in_front, *squares = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
     mean = lambda square: jnp.sqrt(jnp.maximum(square, 0.0) / jnp.maximum(number, 1.0))
-    distance, spread, angle, parallax = map(mean, squares)
-    return Inspection(in_front, distance / pair.focal_left, spread / pair.focal_left, angle, parallax)
+    distance, spread, angle, parallax, sigma = map(mean, squares)
+    return Inspection(in_front, distance / pair.focal_left, spread / pair.focal_left, angle, parallax, sigma)

@@ -217,15 +217,15 @@ def _inspected(
 
     result = adjustment.result
     fair = result == RESULTS.successful
-    noise = jnp.where(checked, adjustment.sigma0, 0.0)
+    free = freedom.astype(adjustment.sigma0.dtype)
+    estimated = jnp.where(checked, adjustment.sigma0, 0.0)
+    noise = degeneracy.noise(estimated, free, inspected.sigma, pair.focal_left)
     worst, worst_chosen = (
         jnp.max(jnp.diagonal(degeneracy.in_radians(of, cofactor)[0]))
         for of, cofactor in ((solved, adjustment.cofactor), (chosen, q))
     )
     direction = degeneracy.worst_direction(pair, solved, adjustment.cofactor)
-    free = freedom.astype(noise.dtype)
-    second, undivided = degeneracy.folded(direction, free, noise)
-    needed = degeneracy.required(free)
+    second, undivided = degeneracy.folded(direction, noise)
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous | second, RESULTS.two_solutions),
@@ -233,14 +233,17 @@ def _inspected(
         (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
         (
             ~elements.exist(unit, length)
-            | (noise**2 * worst_chosen > WEAK**2)
+            | (noise.size**2 * worst_chosen > WEAK**2)
             | (degeneracy.ROUNDING**2 * worst_chosen > worst),  # without redundancy there is no noise to judge by
             RESULTS.elements_undefined,
         ),
-        ((noise**2 * worst > WEAK**2) | (direction.margin < needed * noise) | undivided, RESULTS.weakly_determined),
+        (
+            (noise.size**2 * worst > WEAK**2) | (direction.margin < noise.least_margin) | undivided,
+            RESULTS.weakly_determined,
+        ),
     ):
         result = RESULTS.where(fair & condition_holds, code, result)
-    rotated = degeneracy.pure_rotation(inspected, free, noise) | begin.pure_rotation
+    rotated = degeneracy.pure_rotation(inspected, free, estimated) | begin.pure_rotation
     result = RESULTS.where(rotated, RESULTS.zero_base, result)
     result = RESULTS.where(freedom < 0, RESULTS.too_few_points, result)
     result = RESULTS.where(bad_input, RESULTS.non_finite_input, result)

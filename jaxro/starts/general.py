@@ -11,9 +11,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .. import rotations as rot
+from .. import degeneracy, rotations as rot
 from ..coplanarity import common_focal
-from ..degeneracy import excess, significant
+from ..degeneracy import significant
 from ..elements import RelativePose, vertical
 from ..inspection import inspect
 from ..normal_equations import steps
@@ -77,11 +77,17 @@ class General(AbstractStart):
             best = jax.vmap(lambda pose: _refined(pair, pose, FINAL))(best)
             best, alone = _best_different(pair, best, alone, 2)
         first, second = (jax.tree.map(lambda a, i=i: a[i], best) for i in (0, 1))
-        squares, other = (inspect(pair, pose).distance ** 2 for pose in (first, second))
+        inspected = inspect(pair, first)
+        squares, other = inspected.distance**2, inspect(pair, second).distance ** 2
         left, right = vectors(pair)
         freedom = pair.count - 5
         ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
-        ambiguous = ambiguous & (other < squares * excess(freedom) + EXACT)
+        # distances over f in place of residuals: sigma over f is their unit
+        unit = jnp.where(inspected.sigma > 0, inspected.sigma, 1.0) / pair.focal_left
+        weight = pair.count / unit**2
+        sigma0 = jnp.sqrt(squares * weight / jnp.maximum(freedom, 1.0))
+        expected = degeneracy.noise(sigma0, freedom, inspected.sigma, pair.focal_left)
+        ambiguous = ambiguous & (other < expected.tolerated(squares * weight) / weight + EXACT)
         turn, parallax = rotation_only(left, right, pair.mask)
         noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
         noise = noise * pair.focal_left / common_focal(pair.focal_left, pair.focal_right)
