@@ -136,6 +136,10 @@ CERTAIN = 2.576
 """Normal quantile, of one in 200, from which the better of two orientations is taken for the right one."""
 
 
+SURE = 3.29
+"""The same, of one in 2,000, where both are judged by their own residuals."""
+
+
 class Noise(NamedTuple):
     """The measuring errors a layout is judged by: `size`, the standard deviation of unit weight, its `freedom`, and
     whether it is `expected`, not estimated.
@@ -195,7 +199,7 @@ def excess(freedom: Float[Array, ""]) -> Float[Array, ""]:
     Where both are right, as they are of points in a plane, it has Fisher's distribution with f = n - 5 degrees of
     freedom each. Its quantile by his z: ln F is nearly normal with the variance 4 / (f - 1); for f = 1 as it is.
     """
-    return jnp.where(freedom > 0, jnp.exp(2 * CERTAIN / jnp.sqrt(jnp.maximum(freedom - 1, 0.28))), 1.0)
+    return jnp.where(freedom > 0, jnp.exp(2 * SURE / jnp.sqrt(jnp.maximum(freedom - 1, 0.28))), 1.0)
 
 
 def folded(worst: WorstDirection, noise: Noise) -> tuple[Bool[Array, ""], Bool[Array, ""]]:

@@ -12,7 +12,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from . import coplanarity, degeneracy, rotations as rot, starts
+from . import coplanarity, critical_values, degeneracy, planes, rotations as rot, starts
 from .adjustment import adjust
 from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
 from .guarded import root, times
@@ -76,6 +76,36 @@ class Orientation(eqx.Module):
     def usable(self) -> Bool[Array, "*pairs"]:
         """Whether the elements may be used; `result` says why not, or what to mind."""
         return is_usable(self.result)
+
+    def interval(self, confidence: float = 0.95, *, sigma0: ArrayLike | None = None) -> Float[Array, "*pairs 5"]:
+        """Half widths of the intervals that hold each element with this probability.
+
+        A posteriori: Student's t of n - 5 degrees of freedom times `deviations`; infinite or NaN without any. With the
+        `sigma0` known before the measurement (1 where the sigmas given are standard deviations): the normal quantile
+        times sigma0 sqrt(Q), which exists for five points, too.
+        """
+        if sigma0 is not None:
+            quantile = critical_values.normal(1 - confidence)
+            roots = root(jnp.diagonal(self.cofactor, axis1=-2, axis2=-1))
+            return times(roots, jnp.broadcast_to(sigma0 * quantile, self.sigma0.shape)[..., None])
+        return times(self.deviations, self._quantile(lambda f: critical_values.half_width(confidence, f))[..., None])
+
+    def radius(self, confidence: float = 0.95, *, sigma0: ArrayLike | None = None) -> Float[Array, "*pairs"]:
+        """Of the joint region that holds the five elements with this probability: d of them from the adjusted ones,
+        d' C⁻¹ d <= radius², C the covariance a posteriori or, with a known sigma0, sigma0² Q.
+
+        sqrt(5 F) of 5 and n - 5 degrees of freedom, or the root of the chi-squared quantile of 5.
+        """
+        if sigma0 is not None:
+            known = jnp.sqrt(critical_values.chi_squared(1 - confidence, 5))
+            return jnp.broadcast_to(known, self.sigma0.shape)
+        return self._quantile(lambda f: critical_values.radius(confidence, 5, f))
+
+    def _quantile(self, of: Callable[[Array], Array]) -> Float[Array, "*pairs"]:
+        """A quantile by the degrees of freedom of every pair."""
+        most = max(self.residuals.shape[-1] - 5, 0)
+        table = lambda freedom: critical_values.by_count(of, most, freedom)
+        return jnp.vectorize(table)(jnp.asarray(self.degrees_of_freedom, self.sigma0.dtype))
 
     def corrections(self, pair: Pair) -> Coordinates:
         """The corrections v of (x_left, y_left, x_right, y_right) of the oriented pair, zero where masked."""
@@ -226,6 +256,11 @@ def _inspected(
     )
     direction = degeneracy.worst_direction(pair, solved, adjustment.cofactor)
     second, undivided = degeneracy.folded(direction, noise)
+    # what fits as well if the points lie in a plane; whether they do, Σ r² of it tells
+    asked = inspected.twin & (freedom > 0) & ~begin.ambiguous & fair
+    fixed_pair, fixed_pose = lax.stop_gradient((pair, pose))
+    other = planes.second_squares(fixed_pair, fixed_pose, asked)
+    second = second | (other <= noise.tolerated(free * estimated**2))
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous | second, RESULTS.two_solutions),
