@@ -16,7 +16,6 @@ from .elements import RelativePose
 from .pairs import Pair
 from .reductions import sums
 
-
 ONE_SIDE = 0.5
 """Mean sign of points of which a quarter lies on the other side."""
 
@@ -56,10 +55,27 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
         radius = length - pair.focal_left**2
         # λ = depths[0] / w2; all over f1, which has no sign
         seen_by_twin = jnp.where(w2 - 2 * depths[0] * rot.dot(base, first) > 0, left, -left)
-        terms = jnp.ones_like(g), left + right, seen_by_twin, g * g / square, radius, ratio * sigma**2, ratio * seen**2, sigma**2
+        terms = (
+            jnp.ones_like(g),
+            left + right,
+            seen_by_twin,
+            g * g / square,
+            radius,
+            ratio * sigma**2,
+            ratio * seen**2,
+            sigma**2,
+        )
         return tuple(jnp.where(use, term, 0.0) for term in terms)
 
     number, in_front, twin, *squares = sums(jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask))
     mean = lambda square: jnp.sqrt(jnp.maximum(square, 0.0) / jnp.maximum(number, 1.0))
     distance, spread, angle, parallax, sigma = map(mean, squares)
-    return Inspection(in_front, distance / pair.focal_left, spread / pair.focal_left, angle, parallax, sigma, jnp.abs(twin) >= ONE_SIDE * number)
+    return Inspection(
+        in_front,
+        distance / pair.focal_left,
+        spread / pair.focal_left,
+        angle,
+        parallax,
+        sigma,
+        jnp.abs(twin) >= ONE_SIDE * number,
+    )

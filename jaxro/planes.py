@@ -139,8 +139,9 @@ def similar(one: RelativePose, other: RelativePose) -> Bool[Array, ""]:
 
 
 def plane(pair: Pair, pose: RelativePose, use: Bool[Array, "point"], limit: ArrayLike) -> Plane:
-    """The plane nearest to the points in use: n of c x p1 = (c x b) (n · p1), c = R p2, linear, in turns in which points
-    off it lose their weight. A point lies in it if the homography takes p1 to p2 within `limit` standard deviations."""
+    """The plane nearest to the points in use: n of c x p1 = (c x b) (n · p1), c = R p2, linear, in turns in which
+    points off it lose their weight. A point lies in it if the homography takes p1 to p2 within `limit` standard
+    deviations."""
     rotation, base = pose.relative()
     back = rot.transpose(rotation)
 

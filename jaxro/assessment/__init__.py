@@ -1,0 +1,1 @@
+"""Assessment of an oriented pair: what its result is worth."""
