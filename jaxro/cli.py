@@ -48,6 +48,7 @@ def orient(
         ),
     ] = None,
     force: given.Force = False,
+    confidence: given.Confidence = None,
     tables: given.Tables = None,
     resume: given.Resume = False,
     parquet: given.Parquet = False,
@@ -60,7 +61,20 @@ def orient(
     from .io.job import Options, run
 
     options = Options(
-        file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
+        file,
+        camera,
+        focal,
+        principal_point,
+        pixel_size,
+        y_down,
+        sigma,
+        elements,
+        base,
+        residual,
+        unit,
+        out,
+        force,
+        confidence,
     )
     if given.large(file, parquet, resume, tables, engine):
         from .io import large
