@@ -61,21 +61,8 @@ def orient(
     from .io.job import Options, run
 
     options = Options(
-        file,
-        camera,
-        focal,
-        principal_point,
-        pixel_size,
-        y_down,
-        sigma,
-        elements,
-        base,
-        residual,
-        unit,
-        out,
-        force,
-        confidence,
-    )
+        file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
+    ).at_level(confidence)
     if given.large(file, parquet, resume, tables, engine):
         from .io import large
 

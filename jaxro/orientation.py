@@ -12,9 +12,9 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from . import coplanarity, critical_values, degeneracy, planes, rotations as rot, starts
+from . import chosen_elements, coplanarity, critical_values, degeneracy, planes, starts
 from .adjustment import adjust
-from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
+from .elements import AbstractElements, DependentElements, RelativePose, to_pose
 from .guarded import root, times
 from .inspection import Inspection, inspect
 from .losses import AbstractLoss
@@ -23,7 +23,7 @@ from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned, double
 from .pointwise import pointwise
 from .programs import FAST, QUICK, QUICKEST, Program, loops, traced, whole
-from .reductions import sums, total
+from .reductions import sums
 from .results import RESULTS, is_usable
 
 WEAK = 0.04
@@ -231,9 +231,9 @@ def _inspected(
     solved = adjustment.parameters
     pose = to_pose(solved)
     inspected = inspect(pair, pose)
-    pose, flipped = _facing(pose, inspected, isinstance(solved, RelativePose))
-    length = _length(pair, elements, base, pose)
-    chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
+    pose, flipped = chosen_elements.facing(pose, inspected, isinstance(solved, RelativePose))
+    length = chosen_elements.length(pair, elements, base, pose)
+    chosen, q = chosen_elements.chosen(solved, adjustment.cofactor, flipped, elements, length)
 
     unit = pose.bx, pose.by, pose.bz
     q_of, meet = coplanarity.parallax_of(pair, pose), model_point(pair, pose, chosen, elements.scale(unit, length))
@@ -260,12 +260,15 @@ def _inspected(
     asked = inspected.twin & (freedom > 0) & ~begin.ambiguous & fair
     fixed_pair, fixed_pose = lax.stop_gradient((pair, pose))
     other = planes.second_squares(fixed_pair, fixed_pose, asked)
-    second = second | (other <= noise.tolerated(free * estimated**2))
+    rounding = (
+        planes.ROUNDING * pair.count * (pair.focal_left / jnp.where(inspected.sigma > 0, inspected.sigma, 1.0)) ** 2
+    )
+    second = second | (other <= noise.tolerated(free * estimated**2) + rounding)
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous | second, RESULTS.two_solutions),
         (behind > 0, RESULTS.points_behind_camera),
-        (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
+        (chosen_elements.wrong_side(elements, base, pose), RESULTS.photos_swapped),
         (
             ~elements.exist(unit, length)
             | (noise.size**2 * worst_chosen > WEAK**2)
@@ -306,53 +309,3 @@ def _corrections_of(poses_and_pairs: tuple[RelativePose, Pair]) -> Coordinates:
     pair, _ = cleaned(pair)
     f = coplanarity.fundamental_matrix(*pose.relative(), pair.focal_left, pair.focal_right)
     return jax.vmap(lambda point, use: coplanarity.corrections(f, point, use))(pair.coordinates, pair.mask)
-
-
-def _facing(pose: RelativePose, inspected: Inspection, free: bool) -> tuple[RelativePose, Bool[Array, ""]]:
-    """The pose with the sign of its base that puts most points in front: g does not know that sign."""
-    if not free:
-        return pose, jnp.zeros_like(pose.qw, bool)
-    turn = inspected.in_front < 0
-    sign = jnp.where(turn, -1.0, 1.0)
-    return RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *rot.scaled((pose.bx, pose.by, pose.bz), sign)), turn
-
-
-def _length(pair: Pair, system: type[AbstractElements], base: ArrayLike | None, pose: RelativePose):
-    """bx of the dependent system, b of the independent one: as given, else the mean x-parallax on the side of b."""
-    if system is RelativePose:
-        return jnp.ones_like(pose.bx)
-    if base is not None:
-        return jnp.broadcast_to(jnp.asarray(base, pose.bx.dtype), pose.bx.shape)
-    mean = jnp.abs(total(jnp.where(pair.mask, pair.x_left - pair.x_right, 0.0)) / jnp.maximum(pair.count, 1.0))
-    # a choice of scale, not a measurement: elements have no derivative through it
-    mean = lax.stop_gradient(jnp.where(mean > 1e-6 * pair.focal_left, mean, pair.focal_left))
-    return jnp.where((pose.bx < 0) & (system is DependentElements), -mean, mean)
-
-
-def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractElements], length):
-    """The elements in the chosen system and their cofactors J Q Jᵀ."""
-    if type(solved) is system and system is IndependentElements:
-        return solved, cofactor
-    sign = jnp.where(flipped, -1.0, 1.0)
-
-    def at(step: tuple) -> AbstractElements:
-        pose = to_pose(solved.moved(step))
-        base = (pose.bx * sign, pose.by * sign, pose.bz * sign)
-        return convert(RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *base), system, length)
-
-    origin = (jnp.zeros_like(length),) * 5
-    if system is RelativePose:  # `tangents` of -b are those of b, the second one turned: b1 changes its sign
-        one = jnp.ones_like(sign)
-        signs = jnp.stack([one, one, one, sign, one])
-        return at(origin), cofactor * signs[:, None] * signs[None, :]
-    push = jax.linearize(lambda *x: jnp.stack(at(x).values()), *origin)[1]
-    jacobian = jax.vmap(push, out_axes=1)(*jnp.eye(5, dtype=cofactor.dtype))
-    right = jnp.sum(jacobian[:, :, None] * cofactor[None, :, :], axis=1)
-    return at(origin), jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
-
-
-def _wrong_side(system: type[AbstractElements], base: ArrayLike | None, pose: RelativePose) -> Bool[Array, ""]:
-    """Whether the given bx points away from where the right photo lies."""
-    if system is not DependentElements or base is None:
-        return jnp.zeros_like(pose.bx, bool)
-    return pose.bx * jnp.asarray(base, pose.bx.dtype) < 0

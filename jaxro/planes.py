@@ -37,6 +37,9 @@ STEPS = 6
 BEHIND = 0.25
 """Share of points behind a photo up to which an orientation may be the right one."""
 
+ROUNDING = 1e-18
+"""Mean square distance over f² that is rounding."""
+
 DIFFERENT = 0.05
 """Angle (rad) between rotations or bases from which two orientations are different."""
 

@@ -77,9 +77,9 @@ def after_cleaning(
     """`AfterCleaning` of one pair, the `rejection` that `procedure` found for it, and any procedure.
 
     `sigma0`: standard deviation of unit weight in the simulation; 1 if not given, that is, the sigma of the pair hold,
-    by which procedures judge. `largest`: of the errors planted at random in the right photo, both coordinates uniform
-    within it; if not given the largest correction that a rejected point needs, at least ten sigma. Smaller errors are
-    harder to find: the shares hold for errors of this size.
+    by which procedures judge. `largest`: of the errors planted in the right photo, of both coordinates between the half
+    and all of it, of any sign; if not given twice the largest correction of a rejected point, at least ten sigma.
+    Smaller errors are harder to find: the shares hold for errors of this size.
     """
     pair, _ = cleaned(pair)
     pairs, wrong = trials(pair, rejection, key, repetitions, sigma0=sigma0, largest=largest)
@@ -130,9 +130,11 @@ def trials(
         which, errors, moved = jax.random.split(key, 3)
         rank = jnp.argsort(jnp.argsort(jnp.where(pair.mask, jax.random.uniform(which, pair.mask.shape), 2.0)))
         wrong = (rank < number) & pair.mask
-        noise = unit * pair.sigma * jax.random.normal(errors, (4, *pair.mask.shape))
-        planted = jax.random.uniform(moved, (2, *pair.mask.shape), minval=-1.0, maxval=1.0) * most
-        planted = jnp.where(wrong, planted, 0.0)
+        noise = (unit * pair.sigma)[None, :] * jax.random.normal(errors, (4, *pair.mask.shape))
+        size, sign = jax.random.split(moved)
+        planted = most * jax.random.uniform(size, (2, *pair.mask.shape), minval=0.5, maxval=1.0)
+        planted = planted * jax.random.rademacher(sign, planted.shape, planted.dtype)
+        planted = jnp.where(wrong[None, :], planted, 0.0)
         shifts = (noise[0], noise[1], noise[2] + planted[0], noise[3] + planted[1])
         new = [jnp.where(pair.mask, c + s, 0.0) for c, s in zip(ideal, shifts, strict=True)]
         return Pair(*new, pair.sigma, pair.mask, pair.focal_left, pair.focal_right), wrong
@@ -183,7 +185,7 @@ def judged(
     checked = jnp.where(fine, sigma0, 1.0)
     return Trial(
         answered=fine,
-        exactly_right=jnp.all((mask ^ wrong) | ~pair.mask[None], axis=1),
+        exactly_right=jnp.all((mask ^ wrong) | ~pair.mask[None, :], axis=1),
         without_wrong=~jnp.any(mask & wrong, axis=1),
         inside=squared <= limit * checked**2,
         inside_known=squared <= critical_values.chi_squared(1 - confidence, 5) * unit**2,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,6 +45,10 @@ class Options:
     out: Path | None = None
     force: bool = False
     confidence: float | None = None
+
+    def at_level(self, confidence: float | None) -> "Options":
+        """The same with intervals of this probability."""
+        return replace(self, confidence=confidence)
 
 
 class Example(NamedTuple):
