@@ -85,9 +85,9 @@ def after_cleaning(
     pairs, wrong = trials(pair, rejection, key, repetitions, sigma0=sigma0, largest=largest)
     found = map_batch(_Judged(procedure), pairs)
     measured = judged(pair, rejection.orientation.pose, wrong, found, sigma0, confidence)
-    answered = jnp.sum(measured.answered)
-    share = lambda held: jnp.sum(held & measured.answered) / jnp.maximum(answered, 1)
-    ratio = jnp.sum(jnp.where(measured.answered, measured.ratio, 0.0)) / jnp.maximum(answered, 1)
+    answered = count(measured.answered)
+    share = lambda held: count(held & measured.answered) / jnp.maximum(answered, 1.0)
+    ratio = jnp.sum(jnp.where(measured.answered, measured.ratio, 0.0)) / jnp.maximum(answered, 1.0)
     return AfterCleaning(
         answered=answered / repetitions,
         exactly_right=share(measured.exactly_right),
