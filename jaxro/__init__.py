@@ -22,7 +22,9 @@ from . import (
     layout_design as layout_design,
     levelling as levelling,
     losses as losses,
+    m_estimates as m_estimates,
     mock_surveys as mock_surveys,
+    planes as planes,
     propagation as propagation,
     rejection as rejection,
     reliability as reliability,
@@ -35,6 +37,7 @@ from . import (
 )
 from .adjustment import Adjustment as Adjustment, adjust as adjust
 from .assessment import identification as identification
+from .assessment.after_cleaning import AfterCleaning as AfterCleaning, after_cleaning as after_cleaning
 from .batch import clean_batch as clean_batch, map_batch as map_batch, orient_batch as orient_batch
 from .elements import (
     AbstractElements as AbstractElements,

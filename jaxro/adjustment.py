@@ -20,6 +20,7 @@ from . import normal_equations as normal
 from .elements import AbstractElements
 from .guarded import root, times
 from .losses import AbstractLoss
+from .m_estimates import spread
 from .pointwise import pointwise
 from .programs import part
 from .residuals import Parameters, Residuals, dimension, moved, residuals_of, reweighted, together
@@ -71,8 +72,9 @@ def adjust(
     with elements prepare(R, b) of their `relative`.
     `solver`: any optimistix least-squares solver; `GaussNewton()` if None.
 
-    With a loss, normal matrix and redundancy carry the final weights rho'(r²), and sigma0² = Σ w r² / (n - p): the
-    usual approximation for M-estimators. Derivatives of every field by the observations and cofactors are exact
+    With a loss, normal matrix and redundancy carry the final weights rho'(r²); sigma0 is consistent for normal errors,
+    and sigma0² times `cofactor` is the sandwich covariance of the M-estimate (`m_estimates`), so that the cofactors are
+    not the inverse of the normal matrix. Derivatives of every field by the observations and cofactors are exact
     (implicit function theorem). Failures are values of `result`, never exceptions.
     """
     groups = jax.tree.leaves(observations)[0].shape[0]
@@ -127,16 +129,24 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
     white, redundancy = pointwise(of_group, *groups)
     freedom = len(r) * number.astype(int) - p
     checked = freedom > 0
-    variance = squares / jnp.where(checked, freedom, 1).astype(origin[0].dtype)
+    cofactor = normal.dense(q)
+    if loss is None:
+        sigma0 = root(squares / jnp.where(checked, freedom, 1).astype(origin[0].dtype))
+    else:
+        entries = jnp.concatenate(white)
+        use = jnp.tile(residuals.mask.astype(entries.dtype), len(white))
+        sigma0, factor = spread(loss, entries, use, p)
+        plain, *_ = normal.accumulate(r, jacobian, weight)
+        cofactor = jnp.where(checked, factor, 1.0) * normal.dense(normal.inverse(plain)[0])
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)
     result = RESULTS.where(pivot < normal.SINGULAR, RESULTS.rank_deficient, result)
     return Adjustment(
         residuals.centre,
         normal.dense(n),
-        normal.dense(q),
+        cofactor,
         together(white),
         together(redundancy),
-        jnp.where(checked, root(variance), jnp.nan),
+        jnp.where(checked, sigma0, jnp.nan),
         pivot,
         freedom,
         iterations,

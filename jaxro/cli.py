@@ -48,6 +48,7 @@ def orient(
         ),
     ] = None,
     force: given.Force = False,
+    confidence: given.Confidence = None,
     tables: given.Tables = None,
     resume: given.Resume = False,
     parquet: given.Parquet = False,
@@ -61,7 +62,7 @@ def orient(
 
     options = Options(
         file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
-    )
+    ).at_level(confidence)
     if given.large(file, parquet, resume, tables, engine):
         from .io import large
 

@@ -77,6 +77,22 @@ def fisher(level: ArrayLike, above: ArrayLike, below: ArrayLike) -> Scalar:
     return below / above * (1 - y) / y
 
 
+def half_width(confidence: ArrayLike, freedom: ArrayLike) -> Scalar:
+    """Of the interval that holds a normal number with probability `confidence`, in standard deviations estimated with
+    `freedom` degrees of freedom: Student's t; infinite without any."""
+    freedom = jnp.asarray(freedom, float)
+    t = student((1 - jnp.asarray(confidence, float)) / 2, jnp.maximum(freedom, 1.0))
+    return jnp.where(freedom > 0, t, jnp.inf)
+
+
+def radius(confidence: ArrayLike, numbers: int, freedom: ArrayLike) -> Scalar:
+    """Of the region that holds so many normal `numbers` together, in standard deviations estimated with `freedom`
+    degrees of freedom: sqrt(numbers F); infinite without any."""
+    freedom = jnp.asarray(freedom, float)
+    f = fisher(1 - jnp.asarray(confidence, float), numbers, jnp.maximum(freedom, 1.0))
+    return jnp.where(freedom > 0, jnp.sqrt(numbers * f), jnp.inf)
+
+
 def grubbs(level: ArrayLike, count: ArrayLike) -> Scalar:
     """One-sided, of (mean - smallest) / S of a normal sample, S over n as in eq. (9) of 1989:
 

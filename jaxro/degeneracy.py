@@ -121,6 +121,59 @@ def _worst(cofactor: Float[Array, "p p"]) -> list:
     return column
 
 
+NOMINAL = 3e-4
+"""Standard deviation of a coordinate over the focal length that no measurement worth the name exceeds: 0.05 mm in a
+photo of 150 mm, a third of a pixel at 1,000 pixels."""
+
+FEW = 2.0
+"""Degrees of freedom up to which sigma0 is too uncertain to judge a layout by."""
+
+CREDIBLE = 3.0
+"""Multiple of the expected sigma0 up to which the estimated one does not refute it: with one degree of freedom it is
+exceeded once in 370 times."""
+
+CERTAIN = 2.576
+"""Normal quantile, of one in 200, from which the better of two orientations is taken for the right one."""
+
+
+SURE = 3.29
+"""The same, of one in 2,000, where both are judged by their own residuals."""
+
+
+class Noise(NamedTuple):
+    """The measuring errors a layout is judged by: `size`, the standard deviation of unit weight, its `freedom`, and
+    whether it is `expected`, not estimated.
+
+    With one or two degrees of freedom the estimated sigma0 is often small by chance. Were layouts judged by it, those
+    called good would be those with a sigma0 too small, and the intervals of their elements with it. Such pairs are
+    judged by what is expected before the measurement, unless sigma0 refutes it: the given sigma, or `NOMINAL` times
+    the focal length where the given one is larger, as it is where it only tells the unit.
+    """
+
+    size: Float[Array, ""]
+    freedom: Float[Array, ""]
+    expected: Bool[Array, ""]
+
+    def tolerated(self, squares: Float[Array, ""]) -> Float[Array, ""]:
+        """Σ r² up to which another orientation fits as well as the one with Σ r² = squares."""
+        more = CERTAIN**2 * self.freedom * self.size**2
+        return jnp.where(self.expected, squares + more, squares * excess(self.freedom))
+
+    @property
+    def least_margin(self) -> Float[Array, ""]:
+        """The `margin` below which a layout is not told from one that determines nothing."""
+        return jnp.where(self.expected, 4.0, required(self.freedom)) * self.size
+
+
+def noise(
+    sigma0: Float[Array, ""], freedom: Float[Array, ""], sigma: Float[Array, ""], focal: Float[Array, ""]
+) -> Noise:
+    """`Noise` of a pair whose sigmas have the root mean square `sigma`."""
+    unit = jnp.minimum(1.0, NOMINAL * focal / jnp.where(sigma > 0, sigma, 1.0))
+    expected = (freedom > 0) & (freedom <= FEW) & (sigma0 <= CREDIBLE * unit)
+    return Noise(jnp.where(expected, unit, sigma0), freedom, expected)
+
+
 def required(freedom: Float[Array, ""]) -> Float[Array, ""]:
     """Multiple of sigma0 below which a `margin` is not told from measuring errors: 4, and more where sigma0 itself is
     uncertain, having few degrees of freedom (64 with one)."""
@@ -132,9 +185,6 @@ def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:
     uncertain."""
     return 4 + 12 / jnp.maximum(freedom, 1.0)
 
-
-CERTAIN = 2.576
-"""Normal quantile, of one in 200, from which the better of two orientations is taken for the right one."""
 
 NEAR = 0.5
 """rad: further away the second order tells nothing."""
@@ -149,16 +199,15 @@ def excess(freedom: Float[Array, ""]) -> Float[Array, ""]:
     Where both are right, as they are of points in a plane, it has Fisher's distribution with f = n - 5 degrees of
     freedom each. Its quantile by his z: ln F is nearly normal with the variance 4 / (f - 1); for f = 1 as it is.
     """
-    return jnp.where(freedom > 0, jnp.exp(2 * CERTAIN / jnp.sqrt(jnp.maximum(freedom - 1, 0.28))), 1.0)
+    return jnp.where(freedom > 0, jnp.exp(2 * SURE / jnp.sqrt(jnp.maximum(freedom - 1, 0.28))), 1.0)
 
 
-def folded(
-    worst: WorstDirection, freedom: Float[Array, ""], noise: Float[Array, ""]
-) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+def folded(worst: WorstDirection, noise: Noise) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether there is a second minimum that fits as well, and whether nothing parts it from the first."""
-    fits = worst.rise < (excess(freedom) - 1) * freedom * noise**2
-    second = fits & (worst.turn < NEAR) & (freedom > 0)
-    return second, second & (worst.away < SEPARATE * noise)
+    squares = jnp.where(noise.expected, 0.0, noise.freedom * noise.size**2)
+    fits = worst.rise < noise.tolerated(squares) - squares
+    second = fits & (worst.turn < NEAR) & (noise.freedom > 0)
+    return second, second & (worst.away < SEPARATE * noise.size)
 
 
 def pure_rotation(inspected: Inspection, freedom: Float[Array, ""], noise: Float[Array, ""]) -> Bool[Array, ""]:

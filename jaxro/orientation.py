@@ -12,9 +12,9 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from . import coplanarity, degeneracy, rotations as rot, starts
+from . import chosen_elements, coplanarity, critical_values, degeneracy, planes, starts
 from .adjustment import adjust
-from .elements import AbstractElements, DependentElements, IndependentElements, RelativePose, convert, to_pose
+from .elements import AbstractElements, DependentElements, RelativePose, to_pose
 from .guarded import root, times
 from .inspection import Inspection, inspect
 from .losses import AbstractLoss
@@ -23,7 +23,7 @@ from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned, double
 from .pointwise import pointwise
 from .programs import FAST, QUICK, QUICKEST, Program, loops, traced, whole
-from .reductions import sums, total
+from .reductions import sums
 from .results import RESULTS, is_usable
 
 WEAK = 0.04
@@ -76,6 +76,36 @@ class Orientation(eqx.Module):
     def usable(self) -> Bool[Array, "*pairs"]:
         """Whether the elements may be used; `result` says why not, or what to mind."""
         return is_usable(self.result)
+
+    def interval(self, confidence: float = 0.95, *, sigma0: ArrayLike | None = None) -> Float[Array, "*pairs 5"]:
+        """Half widths of the intervals that hold each element with this probability.
+
+        A posteriori: Student's t of n - 5 degrees of freedom times `deviations`; infinite or NaN without any. With the
+        `sigma0` known before the measurement (1 where the sigmas given are standard deviations): the normal quantile
+        times sigma0 sqrt(Q), which exists for five points, too.
+        """
+        if sigma0 is not None:
+            quantile = critical_values.normal(1 - confidence)
+            roots = root(jnp.diagonal(self.cofactor, axis1=-2, axis2=-1))
+            return times(roots, jnp.broadcast_to(sigma0 * quantile, self.sigma0.shape)[..., None])
+        return times(self.deviations, self._quantile(lambda f: critical_values.half_width(confidence, f))[..., None])
+
+    def radius(self, confidence: float = 0.95, *, sigma0: ArrayLike | None = None) -> Float[Array, "*pairs"]:
+        """Of the joint region that holds the five elements with this probability: d of them from the adjusted ones,
+        d' C⁻¹ d <= radius², C the covariance a posteriori or, with a known sigma0, sigma0² Q.
+
+        sqrt(5 F) of 5 and n - 5 degrees of freedom, or the root of the chi-squared quantile of 5.
+        """
+        if sigma0 is not None:
+            known = jnp.sqrt(critical_values.chi_squared(1 - confidence, 5))
+            return jnp.broadcast_to(known, self.sigma0.shape)
+        return self._quantile(lambda f: critical_values.radius(confidence, 5, f))
+
+    def _quantile(self, of: Callable[[Array], Array]) -> Float[Array, "*pairs"]:
+        """A quantile by the degrees of freedom of every pair."""
+        most = max(self.residuals.shape[-1] - 5, 0)
+        table = lambda freedom: critical_values.by_count(of, most, freedom)
+        return jnp.vectorize(table)(jnp.asarray(self.degrees_of_freedom, self.sigma0.dtype))
 
     def corrections(self, pair: Pair) -> Coordinates:
         """The corrections v of (x_left, y_left, x_right, y_right) of the oriented pair, zero where masked."""
@@ -201,9 +231,9 @@ def _inspected(
     solved = adjustment.parameters
     pose = to_pose(solved)
     inspected = inspect(pair, pose)
-    pose, flipped = _facing(pose, inspected, isinstance(solved, RelativePose))
-    length = _length(pair, elements, base, pose)
-    chosen, q = _chosen(solved, adjustment.cofactor, flipped, elements, length)
+    pose, flipped = chosen_elements.facing(pose, inspected, isinstance(solved, RelativePose))
+    length = chosen_elements.length(pair, elements, base, pose)
+    chosen, q = chosen_elements.chosen(solved, adjustment.cofactor, flipped, elements, length)
 
     unit = pose.bx, pose.by, pose.bz
     q_of, meet = coplanarity.parallax_of(pair, pose), model_point(pair, pose, chosen, elements.scale(unit, length))
@@ -217,30 +247,41 @@ def _inspected(
 
     result = adjustment.result
     fair = result == RESULTS.successful
-    noise = jnp.where(checked, adjustment.sigma0, 0.0)
+    free = freedom.astype(adjustment.sigma0.dtype)
+    estimated = jnp.where(checked, adjustment.sigma0, 0.0)
+    noise = degeneracy.noise(estimated, free, inspected.sigma, pair.focal_left)
     worst, worst_chosen = (
         jnp.max(jnp.diagonal(degeneracy.in_radians(of, cofactor)[0]))
         for of, cofactor in ((solved, adjustment.cofactor), (chosen, q))
     )
     direction = degeneracy.worst_direction(pair, solved, adjustment.cofactor)
-    free = freedom.astype(noise.dtype)
-    second, undivided = degeneracy.folded(direction, free, noise)
-    needed = degeneracy.required(free)
+    second, undivided = degeneracy.folded(direction, noise)
+    # what fits as well if the points lie in a plane; whether they do, Σ r² of it tells
+    asked = inspected.twin & (freedom > 0) & ~begin.ambiguous & fair
+    fixed_pair, fixed_pose = lax.stop_gradient((pair, pose))
+    other = planes.second_squares(fixed_pair, fixed_pose, asked)
+    rounding = (
+        planes.ROUNDING * pair.count * (pair.focal_left / jnp.where(inspected.sigma > 0, inspected.sigma, 1.0)) ** 2
+    )
+    second = second | (other <= noise.tolerated(free * estimated**2) + rounding)
     for condition_holds, code in (
         (freedom == 0, RESULTS.no_redundancy),
         (begin.ambiguous | second, RESULTS.two_solutions),
         (behind > 0, RESULTS.points_behind_camera),
-        (_wrong_side(elements, base, pose), RESULTS.photos_swapped),
+        (chosen_elements.wrong_side(elements, base, pose), RESULTS.photos_swapped),
         (
             ~elements.exist(unit, length)
-            | (noise**2 * worst_chosen > WEAK**2)
+            | (noise.size**2 * worst_chosen > WEAK**2)
             | (degeneracy.ROUNDING**2 * worst_chosen > worst),  # without redundancy there is no noise to judge by
             RESULTS.elements_undefined,
         ),
-        ((noise**2 * worst > WEAK**2) | (direction.margin < needed * noise) | undivided, RESULTS.weakly_determined),
+        (
+            (noise.size**2 * worst > WEAK**2) | (direction.margin < noise.least_margin) | undivided,
+            RESULTS.weakly_determined,
+        ),
     ):
         result = RESULTS.where(fair & condition_holds, code, result)
-    rotated = degeneracy.pure_rotation(inspected, free, noise) | begin.pure_rotation
+    rotated = degeneracy.pure_rotation(inspected, free, estimated) | begin.pure_rotation
     result = RESULTS.where(rotated, RESULTS.zero_base, result)
     result = RESULTS.where(freedom < 0, RESULTS.too_few_points, result)
     result = RESULTS.where(bad_input, RESULTS.non_finite_input, result)
@@ -268,53 +309,3 @@ def _corrections_of(poses_and_pairs: tuple[RelativePose, Pair]) -> Coordinates:
     pair, _ = cleaned(pair)
     f = coplanarity.fundamental_matrix(*pose.relative(), pair.focal_left, pair.focal_right)
     return jax.vmap(lambda point, use: coplanarity.corrections(f, point, use))(pair.coordinates, pair.mask)
-
-
-def _facing(pose: RelativePose, inspected: Inspection, free: bool) -> tuple[RelativePose, Bool[Array, ""]]:
-    """The pose with the sign of its base that puts most points in front: g does not know that sign."""
-    if not free:
-        return pose, jnp.zeros_like(pose.qw, bool)
-    turn = inspected.in_front < 0
-    sign = jnp.where(turn, -1.0, 1.0)
-    return RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *rot.scaled((pose.bx, pose.by, pose.bz), sign)), turn
-
-
-def _length(pair: Pair, system: type[AbstractElements], base: ArrayLike | None, pose: RelativePose):
-    """bx of the dependent system, b of the independent one: as given, else the mean x-parallax on the side of b."""
-    if system is RelativePose:
-        return jnp.ones_like(pose.bx)
-    if base is not None:
-        return jnp.broadcast_to(jnp.asarray(base, pose.bx.dtype), pose.bx.shape)
-    mean = jnp.abs(total(jnp.where(pair.mask, pair.x_left - pair.x_right, 0.0)) / jnp.maximum(pair.count, 1.0))
-    # a choice of scale, not a measurement: elements have no derivative through it
-    mean = lax.stop_gradient(jnp.where(mean > 1e-6 * pair.focal_left, mean, pair.focal_left))
-    return jnp.where((pose.bx < 0) & (system is DependentElements), -mean, mean)
-
-
-def _chosen(solved: AbstractElements, cofactor, flipped, system: type[AbstractElements], length):
-    """The elements in the chosen system and their cofactors J Q Jᵀ."""
-    if type(solved) is system and system is IndependentElements:
-        return solved, cofactor
-    sign = jnp.where(flipped, -1.0, 1.0)
-
-    def at(step: tuple) -> AbstractElements:
-        pose = to_pose(solved.moved(step))
-        base = (pose.bx * sign, pose.by * sign, pose.bz * sign)
-        return convert(RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *base), system, length)
-
-    origin = (jnp.zeros_like(length),) * 5
-    if system is RelativePose:  # `tangents` of -b are those of b, the second one turned: b1 changes its sign
-        one = jnp.ones_like(sign)
-        signs = jnp.stack([one, one, one, sign, one])
-        return at(origin), cofactor * signs[:, None] * signs[None, :]
-    push = jax.linearize(lambda *x: jnp.stack(at(x).values()), *origin)[1]
-    jacobian = jax.vmap(push, out_axes=1)(*jnp.eye(5, dtype=cofactor.dtype))
-    right = jnp.sum(jacobian[:, :, None] * cofactor[None, :, :], axis=1)
-    return at(origin), jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
-
-
-def _wrong_side(system: type[AbstractElements], base: ArrayLike | None, pose: RelativePose) -> Bool[Array, ""]:
-    """Whether the given bx points away from where the right photo lies."""
-    if system is not DependentElements or base is None:
-        return jnp.zeros_like(pose.bx, bool)
-    return pose.bx * jnp.asarray(base, pose.bx.dtype) < 0

@@ -1,1 +1,1 @@
-"""What an oriented pair could tell: assessment beyond its residuals."""
+"""What an oriented pair is worth: assessment beyond its residuals."""

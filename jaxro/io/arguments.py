@@ -92,6 +92,15 @@ Base = Annotated[
     ),
 ]
 Minimised = Annotated[Residual, typer.Option(help="What is minimised: whitened conditions, or strict y-parallaxes.")]
+Confidence = Annotated[
+    float | None,
+    typer.Option(
+        help="Show and write the intervals that hold the elements with this probability, e.g. 0.95: Student's t, or "
+        "normal where sigma is given. Of CSV results.",
+        metavar="P",
+        show_default=False,
+    ),
+]
 Unit = Annotated[str, typer.Option(help="Name of the photo unit in reports: mm, px.", metavar="NAME")]
 Force = Annotated[
     bool,

@@ -19,7 +19,7 @@ from typing import Any
 
 from . import reading
 from .fields import TableError
-from .solutions import Solution, Units
+from .solutions import Element, Solution, Units
 
 
 def check_target(directory: Path, force: bool) -> None:
@@ -168,7 +168,7 @@ def _json(solved: list[Solution], units: Units, summary: dict[str, Any]) -> str:
             **_counts(s),
             "m_q": s.m_q,
             "sigma0": s.sigma0,
-            "elements": {e.name: {"unit": e.unit or None, "value": e.value, "sd": e.deviation} for e in s.elements},
+            "elements": {e.name: _element(e) for e in s.elements},
             "correlations": s.correlations,
             "cameras": [
                 {
@@ -188,6 +188,11 @@ def _json(solved: list[Solution], units: Units, summary: dict[str, Any]) -> str:
         "pairs": pairs,
     }
     return json_text(whole)
+
+
+def _element(e: Element) -> dict[str, Any]:
+    value = {"unit": e.unit or None, "value": e.value, "sd": e.deviation}
+    return value if e.half_width is None else value | {"half_width": e.half_width}
 
 
 def json_text(value: Any) -> str:

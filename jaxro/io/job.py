@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,6 +44,11 @@ class Options:
     unit: str = "mm"
     out: Path | None = None
     force: bool = False
+    confidence: float | None = None
+
+    def at_level(self, confidence: float | None) -> "Options":
+        """The same with intervals of this probability."""
+        return replace(self, confidence=confidence)
 
 
 class Example(NamedTuple):
@@ -82,6 +87,12 @@ class Job:
         """Whether the standard deviation of the coordinates is given."""
         return self.table.has_sigma or self.options.sigma is not None
 
+    @property
+    def interval(self) -> solutions.Interval | None:
+        """The intervals that were asked for."""
+        confidence = self.options.confidence
+        return None if confidence is None else solutions.Interval(confidence, self.sigma_known)
+
     def read(self, orientation: Orientation, pair: Pair) -> Solved:
         """The orientation with what is told of its points; of a batch as well."""
         return solutions.read(orientation, pair, self.options.residual == "rigorous", self.sigma_known)
@@ -102,6 +113,7 @@ class Job:
             "residual": self.options.residual,
             "base": self.options.base,
             "sigma": self.options.sigma,
+            **({} if self.interval is None else {"confidence": self.interval.confidence}),
             "usable": sum(s.usable for s in solved),
             "failed": sum(not s.usable for s in solved),
             "warnings": self.table.warnings,
@@ -140,7 +152,7 @@ def run(options: Options) -> bool:
     warn(errors, job)
     with progress(errors, "Orienting", len(job.pairs)) as told:
         oriented = orient_all(job, told)
-    solved = solutions.solutions(job.table.pairs, job.cameras, oriented, job.units)
+    solved = solutions.solutions(job.table.pairs, job.cameras, oriented, job.units, job.interval)
     texts = {} if options.out is None else files.texts(solved, job.units, job.summary(solved))
     show(console, job, solved)
     write(job, texts)
@@ -214,6 +226,8 @@ def check_numbers(options: Options, has_sigma: bool, file: str, system: type[Abs
     """Raises TableError for a sigma, base or unit that cannot be."""
     if not options.unit.strip() or any(mark in options.unit for mark in "[]\n"):
         raise TableError("--unit", None, None, repr(options.unit), "a name such as mm or px, without brackets")
+    if options.confidence is not None and not 0 < options.confidence < 1:
+        raise TableError("--confidence", None, None, repr(options.confidence), "a probability such as 0.95")
     if options.sigma is not None:
         if has_sigma:
             raise TableError("--sigma", None, None, f"it beside the column sigma of {file}", "only one of the two")

@@ -33,11 +33,13 @@ def _one(console: Console, s: Solution, units: Units, subtitle: str) -> None:
     console.print(_cameras(s, units) + subtitle)
     console.print(_verdict(s))
     if s.usable:
-        elements = table("element", "value", "± sd", "unit")
+        asked = () if s.interval is None else (f"± {100 * s.interval.confidence:g} %",)
+        elements = table("element", "value", "± sd", *asked, "unit")
         for e in s.elements:
             decimals = digits(e.deviation)
             sd = "given" if e.deviation is None else number(e.deviation, decimals)
-            elements.add_row(e.name, number(e.value, decimals), sd, _unit(e.unit))
+            wide = "" if e.half_width is None else number(e.half_width, decimals)
+            elements.add_row(e.name, number(e.value, decimals), sd, *(wide for _ in asked), _unit(e.unit))
         console.print(elements)
         sigma0 = f"sigma0 {number(s.sigma0, digits(s.sigma0))}" + (f" {units.sigma0}" if units.sigma0 else "")
         m_q = f"m_q {number(s.m_q, digits(s.m_q))} {units.photo}"

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .. import rotations as rot
+from .. import critical_values, rotations as rot
 from ..elements import AbstractElements, DependentElements, RelativePose
 from ..guarded import root
 from ..orientation import Orientation
@@ -44,12 +44,14 @@ class Units:
 
 @dataclass(frozen=True)
 class Element:
-    """One reported number of an orientation; `deviation` is None for what is given, not adjusted."""
+    """One reported number of an orientation; `deviation` is None for what is given, not adjusted, and `half_width`,
+    that of its interval, where none was asked for."""
 
     name: str
     unit: str
     value: float
     deviation: float | None
+    half_width: float | None = None
 
 
 class Solved(NamedTuple):
@@ -97,6 +99,7 @@ class Solution:
     corrections: tuple[Any, ...]
     reading: Reliability | None
     elements: list[Element]
+    interval: "Interval | None" = None
 
     @cached_property
     def result(self) -> str:
@@ -197,12 +200,33 @@ def given(name: str, system: type[AbstractElements]) -> bool:
     return system is DependentElements and name == "bx"
 
 
-def shown_elements(found: Solved, units: Units) -> list[Element]:
+class Interval(NamedTuple):
+    """What was asked for: the probability, and whether the sigmas are true standard deviations."""
+
+    confidence: float
+    sigma_known: bool
+
+    def factor(self, o: Orientation) -> float:
+        """Half width over the standard deviation a posteriori: of Student's t, or of a normal number and sigma0 = 1."""
+        if self.sigma_known:
+            sigma0 = float(o.sigma0)
+            return float(critical_values.normal(1 - self.confidence)) / sigma0 if sigma0 > 0 else np.nan
+        return float(critical_values.half_width(self.confidence, int(o.degrees_of_freedom)))
+
+
+def shown_elements(found: Solved, units: Units, interval: Interval | None = None) -> list[Element]:
     """The elements of an orientation with their standard deviations, NaN where it is not usable."""
     system = type(found.orientation.elements)
+    factor = None if interval is None else interval.factor(found.orientation)
     known = float if _usable(found.orientation) else lambda number: np.nan
     return [
-        Element(name, unit_of(name, units), known(value), None if given(name, system) else known(deviation))
+        Element(
+            name,
+            unit_of(name, units),
+            known(value),
+            None if given(name, system) else known(deviation),
+            None if factor is None or given(name, system) else known(deviation) * factor,
+        )
         for name, value, deviation in zip(element_names(system), *found.elements, strict=True)
     ]
 
@@ -212,9 +236,10 @@ def solutions(
     cameras: list[tuple[Camera, Camera]],
     found: list[Solved],
     units: Units,
+    interval: Interval | None = None,
 ) -> list[Solution]:
     """One `Solution` a pair, the elements of unusable ones NaN."""
     return [
-        Solution(m, c, s.orientation, s.corrections, s.reading, shown_elements(s, units))
+        Solution(m, c, s.orientation, s.corrections, s.reading, shown_elements(s, units, interval), interval)
         for m, c, s in zip(measured, cameras, found, strict=True)
     ]

@@ -7,13 +7,12 @@ others, so that a second orientation that fits as well is seen and reported.
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .. import rotations as rot
+from .. import degeneracy, planes, rotations as rot
 from ..coplanarity import common_focal
-from ..degeneracy import excess, significant
+from ..degeneracy import significant
 from ..elements import RelativePose, vertical
 from ..inspection import inspect
 from ..normal_equations import steps
@@ -39,9 +38,6 @@ BEHIND = 0.25
 
 ENOUGH = 10
 """Points that are enough for a start."""
-
-DIFFERENT = 0.05
-"""Angle (rad) between rotations or bases from which two candidates are different orientations."""
 
 AT_ONCE, ON_DEVICES = 1 << 7, 1 << 17
 """Points that are worked on together under a caller's `vmap`, at 15 kB each: what stays in the cache of a processor,
@@ -76,12 +72,19 @@ class General(AbstractStart):
         if judges is not pair:
             best = jax.vmap(lambda pose: _refined(pair, pose, FINAL))(best)
             best, alone = _best_different(pair, best, alone, 2)
+        best, alone = _with_twin(pair, best, alone)
         first, second = (jax.tree.map(lambda a, i=i: a[i], best) for i in (0, 1))
-        squares, other = (inspect(pair, pose).distance ** 2 for pose in (first, second))
+        inspected = inspect(pair, first)
+        squares, other = inspected.distance**2, inspect(pair, second).distance ** 2
         left, right = vectors(pair)
         freedom = pair.count - 5
         ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
-        ambiguous = ambiguous & (other < squares * excess(freedom) + EXACT)
+        # distances over f in place of residuals: sigma over f is their unit
+        unit = jnp.where(inspected.sigma > 0, inspected.sigma, 1.0) / pair.focal_left
+        weight = pair.count / unit**2
+        sigma0 = jnp.sqrt(squares * weight / jnp.maximum(freedom, 1.0))
+        expected = degeneracy.noise(sigma0, freedom, inspected.sigma, pair.focal_left)
+        ambiguous = ambiguous & (other < expected.tolerated(squares * weight) / weight + EXACT)
         turn, parallax = rotation_only(left, right, pair.mask)
         noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
         noise = noise * pair.focal_left / common_focal(pair.focal_left, pair.focal_right)
@@ -182,7 +185,7 @@ def _best_different(pair: Pair, poses: RelativePose, real: Bool[Array, " candida
         here = jnp.arange(count) == k
         chosen = jax.tree.map(lambda a, b: jnp.where(here, b, a), chosen, pose)
         found = jnp.where(here, there, found)
-        near = jax.vmap(lambda other: _similar(pose, other))(poses)
+        near = jax.vmap(lambda other: planes.similar(pose, other))(poses)
         return chosen, found, jnp.where(near | best, jnp.inf, score)
 
     empty = jax.tree.map(lambda a: jnp.zeros(count, a.dtype), poses)
@@ -190,11 +193,12 @@ def _best_different(pair: Pair, poses: RelativePose, real: Bool[Array, " candida
     return chosen, found
 
 
-def _similar(one: RelativePose, other: RelativePose) -> Bool[Array, ""]:
-    """Whether rotation and base agree within DIFFERENT."""
-    q = one.qw * other.qw + one.qx * other.qx + one.qy * other.qy + one.qz * other.qz
-    b = one.bx * other.bx + one.by * other.by + one.bz * other.bz
-    return (jnp.abs(q) > float(np.cos(DIFFERENT / 2))) & (b > float(np.cos(DIFFERENT)))
+def _with_twin(pair: Pair, best: RelativePose, alone: Bool[Array, "2"]):
+    """The two best of these two and of the second orientation that the first has if the points lie in a plane."""
+    first = jax.tree.map(lambda a: a[0], best)
+    twin, exists = planes.second(pair, first, planes.plane(pair, first, pair.mask, jnp.inf).normal)
+    three = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), best, twin)
+    return _best_different(pair, three, jnp.concatenate([alone, exists[None]]), 2)
 
 
 def _refined(pair: Pair, pose: RelativePose, count: int) -> RelativePose:
