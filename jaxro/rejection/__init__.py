@@ -13,6 +13,7 @@ from .graduated_non_convexity import GraduatedNonConvexity as GraduatedNonConvex
 from .least_median import LeastMedian as LeastMedian
 from .leave_one_out_grubbs import LeaveOneOutGrubbs as LeaveOneOutGrubbs, calibrated as calibrated
 from .mean_parallax import MeanParallax as MeanParallax
+from .noise import Noise as Noise, noise_of as noise_of, pooled as pooled
 from .ransac import Ransac as Ransac
 from .recommended import Recommended as Recommended
 from .reweighting import Reweighting as Reweighting
