@@ -1,19 +1,18 @@
 """The test of agreement between the residuals of neighbouring points, and the accuracy where there is some."""
 
 import json
-from contextlib import redirect_stdout
 from functools import cache
-from io import StringIO
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import jaxro
 from jaxro import IndependentElements, Pair, simulation
 from jaxro.assessment import correlated_covariance, neighbours, pattern, pooled
-from jaxro.cli import main
+from jaxro.cli import app
 from jaxro.conditions import linearised
 from jaxro.rejection.robust import improved
 
@@ -168,7 +167,7 @@ def test_correlated_covariance_is_the_scatter(elements):
 
 
 def test_report_says_it(tmp_path):
-    """One pair and a table of three, errors correlated over the photo: sentence, and probability and rho in the JSON."""
+    """One pair and a table of three, correlated errors: the sentence, and probability and rho in the JSON."""
     rng = np.random.default_rng(2)
     ideal, _ = programs()
     pairs = ideal(places(40, False, 3, rng))
@@ -181,10 +180,9 @@ def test_report_says_it(tmp_path):
         ]
         table, out = tmp_path / f"{count}.csv", tmp_path / f"out{count}"
         table.write_text("\n".join(rows) + "\n", encoding="utf-8")
-        said = StringIO()
-        with redirect_stdout(said):
-            main(["orient", str(table), "--focal", "70", "--out", str(out)])
+        told = CliRunner().invoke(app, ["orient", str(table), "--focal", "70", "--out", str(out)])
+        assert told.exit_code == 0, told.output
         summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-        assert "The standard deviations assume independent errors; here neighbours" in " ".join(said.getvalue().split())
+        assert "The standard deviations assume independent errors; here neighbours" in " ".join(told.output.split())
         assert summary["pattern"]["probability"] < 0.05 and 0.3 < summary["pattern"]["rho"] <= 1
         assert all(p["pattern"] is not None and p["pattern"]["length_mm"] > 0 for p in summary["pairs"])

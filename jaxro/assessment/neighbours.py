@@ -132,7 +132,7 @@ def of_linear(linear: Linear, coordinates: tuple[Any, ...]) -> Pattern:
     return Pattern(
         probability=_tail(score, variance, skew, xp),
         rho=xp.where(known, rhos[chosen], 0.0),
-        length=lengths[chosen],
+        length=xp.asarray(lengths[chosen]),
         score=score,
         variance=variance,
         third=skew,
@@ -163,14 +163,14 @@ def pooled(patterns: Pattern) -> Pattern:
     `rho` and `length` are the means of the pairs, weighted by what each tells of rho.
     """
     xp: Any = np if isinstance(patterns.score, np.ndarray) else jnp
-    score, variance, third = (xp.sum(x) for x in (patterns.score, patterns.variance, patterns.third))
+    score, variance, third = (xp.asarray(xp.sum(x)) for x in (patterns.score, patterns.variance, patterns.third))
     weight = patterns.information
-    whole = xp.sum(weight)
+    whole = xp.asarray(xp.sum(weight))
     share = weight / xp.where(whole > 0, whole, 1.0)
     return Pattern(
         probability=_tail(score, variance, third, xp),
-        rho=xp.sum(share * patterns.rho),
-        length=xp.sum(share * patterns.length),
+        rho=xp.asarray(xp.sum(share * patterns.rho)),
+        length=xp.asarray(xp.sum(share * patterns.length)),
         score=score,
         variance=variance,
         third=third,
