@@ -35,10 +35,10 @@ WARNED = ("no_redundancy", "two_solutions")
 """Usable results with something to mind."""
 
 
-MOST_POINTS = 600
+MOST_POINTS = 200
 """Points of a pair whose residuals are looked at together: of more, every second, third, ... one."""
 
-MOST_PAIRS = 300
+MOST_PAIRS = 100
 """Pairs of a table whose residuals are tested for a pattern: of more, every second, third, ... one."""
 
 
