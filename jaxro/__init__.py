@@ -11,6 +11,7 @@ if "JAX_ENABLE_X64" not in _os.environ:
     _jax.config.update("jax_enable_x64", True)
 
 from . import (
+    assessment as assessment,
     budget as budget,
     coplanarity as coplanarity,
     correlations as correlations,

@@ -83,6 +83,14 @@ def estimate(pairs: Pair, orientations: Orientation, groups: Sequence[ArrayLike]
     return Program(_estimate, {"labels": labels, "size": len(names), "steps": steps})((pairs, orientations))
 
 
+def by_photo(pairs: Pair, orientations: Orientation, *, steps: int = 30) -> Components:
+    """The standard deviations of the left photos (0) and of the right ones (1): `estimate` of these two groups.
+
+    Near-vertical pairs do not tell them apart (`estimable` says so); convergent or tilted ones do.
+    """
+    return estimate(pairs, orientations, (0, 0, 1, 1), steps=steps)
+
+
 def _estimate(data: tuple[Pair, Orientation], *, labels: tuple[Array, ...], size: int, steps: int) -> Components:
     pairs, orientations = data
     shape = pairs.x_left.shape

@@ -88,7 +88,7 @@ def test_classes_of_points_in_near_vertical_pairs():
 
 def test_both_photos_of_convergent_pairs():
     pairs, found = batch(CONVERGENT, by_photo(), 2_000)
-    result = components.estimate(pairs, found, (0, 0, 1, 1))
+    result = components.by_photo(pairs, found)
     within_two(result, (SMALL, LARGE))
     assert np.all(result.standard_error < 1e-3)
     np.testing.assert_allclose(result.pooled**2, (SMALL**2 + LARGE**2) / 2, rtol=0.05)
@@ -131,7 +131,7 @@ def test_an_estimable_group_beside_others_that_are_not():
 def test_restricted_likelihood_is_largest():
     """The maximum over both variances, found by SciPy on dense matrices of all pairs."""
     pairs, found = batch(CONVERGENT, by_photo(), 120)
-    result = components.estimate(pairs, found, (0, 0, 1, 1))
+    result = components.by_photo(pairs, found)
     parts = []
     for i in range(120):
         coordinates = np.stack([np.asarray(c[i]) for c in pairs.coordinates])

@@ -17,9 +17,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from ..assessment import Pattern
 from . import reading
 from .fields import TableError
-from .solutions import Element, Solution, Units
+from .solutions import Element, Solution, Units, pattern_of_all, with_pattern
 
 
 def check_target(directory: Path, force: bool) -> None:
@@ -157,7 +158,16 @@ def csv_text(rows: list[list[Any]]) -> str:
     return text.getvalue()
 
 
+def _pattern(pattern: Pattern | None, units: Units) -> dict[str, float] | None:
+    """The test of a pattern in the residuals."""
+    if pattern is None:
+        return None
+    told = {"probability": pattern.probability, "rho": pattern.rho, head("length", units.photo): pattern.length}
+    return {name: float(value) for name, value in told.items()}
+
+
 def _json(solved: list[Solution], units: Units, summary: dict[str, Any]) -> str:
+    tested = {id(s) for s in with_pattern(solved)}
     pairs = [
         {
             "pair": s.measured.name,
@@ -170,6 +180,7 @@ def _json(solved: list[Solution], units: Units, summary: dict[str, Any]) -> str:
             "sigma0": s.sigma0,
             "elements": {e.name: _element(e) for e in s.elements},
             "correlations": s.correlations,
+            "pattern": _pattern(s.pattern if id(s) in tested else None, units),
             "cameras": [
                 {
                     "focal": c.focal,
@@ -185,6 +196,7 @@ def _json(solved: list[Solution], units: Units, summary: dict[str, Any]) -> str:
     whole = {
         **summary,
         "units": {"photo": units.photo, "model": units.model, "sigma0": units.sigma0 or None, "angles": "deg"},
+        "pattern": _pattern(pattern_of_all(solved), units),
         "pairs": pairs,
     }
     return json_text(whole)

@@ -185,6 +185,8 @@ def show(console: Console, job: Job, solved: list[Solution]) -> None:
     report.show(console, solved, job.units, f"{job.system_name} elements, {job.options.residual} residuals")
     if len(solved) == 1:
         reading.show(console, solved[0], job.units)
+    else:
+        reading.show_of_all(console, solved, job.units)
 
 
 def read_table(options: Options, otherwise: Example) -> tables.Table:

@@ -6,10 +6,11 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
+from ..assessment import Pattern
 from ..experiments.tables import number
 from ..reliability import BOUNDS, CONTROL, Reliability
 from .report import digits, left_out, table, worst
-from .solutions import Solution, Units
+from .solutions import Solution, Units, pattern_of_all
 
 COORDINATES = ("x_left", "y_left", "x_right", "y_right")
 
@@ -22,6 +23,12 @@ def show(console: Console, s: Solution, units: Units) -> None:
     if s.reading is not None and np.any(s.reading.testable):
         _points(console, s, s.reading, units)
     for sentence in sentences(s, units):
+        console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
+
+
+def show_of_all(console: Console, solved: list[Solution], units: Units) -> None:
+    """What to mind of all pairs together."""
+    for sentence in pattern_sentences(pattern_of_all(solved), units, " of all pairs together"):
         console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
 
 
@@ -64,6 +71,7 @@ def sentences(s: Solution, units: Units) -> list[str]:
         )
     if reading is not None:
         said += _doubts(s, reading)
+    said += pattern_sentences(s.pattern, units)
     redundancy = s.orientation.redundancy[: len(s.measured.points)]
     names = [
         [p for p, r in zip(s.measured.points, redundancy, strict=True) if low <= r < high]
@@ -78,6 +86,17 @@ def sentences(s: Solution, units: Units) -> list[str]:
         size = "" if most is None else f"; an error of {number(most, digits(most, 1))} {units.photo} in y may not show"
         said.append(f"Poorly checked (redundancy below {BOUNDS[1]}): {_listed(names[1])}{size}.")
     return said
+
+
+def pattern_sentences(pattern: Pattern | None, units: Units, of: str = "") -> list[str]:
+    """What a pattern in the residuals means, if there is one."""
+    if pattern is None or not pattern.flagged:
+        return []
+    rho, length, chance = (float(x) for x in (pattern.rho, pattern.length, pattern.probability))
+    return [
+        f"The standard deviations assume independent errors; here neighbours{of} agree by {number(rho, 1)}, over about "
+        f"{number(length, digits(length, 0))} {units.photo} (probability {chance:.1g}): they are too small."
+    ]
 
 
 def _doubts(s: Solution, reading: Reliability) -> list[str]:

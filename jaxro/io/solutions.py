@@ -14,10 +14,12 @@ import numpy as np
 from jaxtyping import Array
 
 from .. import critical_values, rotations as rot
+from ..assessment import Pattern, neighbours
+from ..conditions import Linear, linearised
 from ..elements import AbstractElements, DependentElements, RelativePose
 from ..guarded import root
 from ..orientation import Orientation
-from ..pairs import Camera, Coordinates, Pair
+from ..pairs import Camera, Coordinates, Pair, cleaned
 from ..programs import FAST, QUICK, Program
 from ..reliability import Reliability, assess
 from ..results import RESULTS
@@ -31,6 +33,13 @@ ADVICE = {name: RESULTS[item] for name, item in RESULTS._name_to_item.items()}
 
 WARNED = ("no_redundancy", "two_solutions")
 """Usable results with something to mind."""
+
+
+MOST_POINTS = 200
+"""Points of a pair whose residuals are looked at together: of more, every second, third, ... one."""
+
+MOST_PAIRS = 100
+"""Pairs of a table whose residuals are tested for a pattern: of more, every second, third, ... one."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +65,13 @@ class Element:
 
 class Solved(NamedTuple):
     """An orientation as it comes from the engine, the corrections of the coordinates, the numbers that are reported of
-    its elements, and its reliability if asked."""
+    its elements, and, if asked, its reliability, and the linearised conditions with the coordinates they stand at."""
 
     orientation: Orientation
     corrections: Coordinates
     elements: tuple[list[Array], list[Array]]
     reading: Reliability | None
+    conditions: tuple[Linear, Coordinates] | None
 
 
 def read(orientation: Orientation, pair: Pair, reliable: bool, sigma_known: bool) -> Solved:
@@ -82,7 +92,11 @@ def read(orientation: Orientation, pair: Pair, reliable: bool, sigma_known: bool
 def _told(read: tuple[Pair, Orientation], *, reliable: bool, sigma0) -> tuple:
     pair, o = read
     elements = element_values(o.elements, o.cofactor, o.sigma0)
-    return o.corrections(pair), elements, assess(pair, o, sigma0=sigma0) if reliable else None
+    if not reliable:
+        return o.corrections(pair), elements, None, None
+    used = cleaned(pair)[0]
+    conditions = linearised(used, o.pose), used.coordinates
+    return o.corrections(pair), elements, assess(pair, o, sigma0=sigma0), conditions
 
 
 def _all_told(read: tuple[Pair, Orientation], **options) -> tuple:
@@ -100,6 +114,16 @@ class Solution:
     reading: Reliability | None
     elements: list[Element]
     interval: "Interval | None" = None
+    conditions: tuple[Linear, tuple[Any, ...]] | None = None
+
+    @cached_property
+    def pattern(self) -> Pattern | None:
+        """Whether residuals of neighbouring points agree, of at most MOST_POINTS points; None where nothing tells."""
+        if self.conditions is None or not self.usable or int(self.orientation.degrees_of_freedom) < 2:
+            return None
+        used = np.flatnonzero(self.conditions[0].weight > 0)
+        used = used[:: -(-len(used) // MOST_POINTS)]
+        return neighbours.of_linear(*jax.tree.map(lambda a: a[used], self.conditions))
 
     @cached_property
     def result(self) -> str:
@@ -240,6 +264,26 @@ def solutions(
 ) -> list[Solution]:
     """One `Solution` a pair, the elements of unusable ones NaN."""
     return [
-        Solution(m, c, s.orientation, s.corrections, s.reading, shown_elements(s, units, interval), interval)
+        Solution(
+            measured=m,
+            cameras=c,
+            orientation=s.orientation,
+            corrections=s.corrections,
+            reading=s.reading,
+            elements=shown_elements(s, units, interval),
+            interval=interval,
+            conditions=s.conditions,
+        )
         for m, c, s in zip(measured, cameras, found, strict=True)
     ]
+
+
+def with_pattern(solved: list[Solution]) -> list[Solution]:
+    """The pairs that are tested for a pattern in their residuals, at most MOST_PAIRS."""
+    return solved[:: max(1, -(-len(solved) // MOST_PAIRS))]
+
+
+def pattern_of_all(solved: list[Solution]) -> Pattern | None:
+    """The test of all pairs together, from those `with_pattern`; None where nothing tells."""
+    found = [s.pattern for s in with_pattern(solved) if s.pattern is not None]
+    return neighbours.pooled(jax.tree.map(lambda *a: np.stack(a), *found)) if found else None
