@@ -307,7 +307,7 @@ def test_the_six_conclusions_of_1989(paper_1989):
 
 @pytest.mark.slow
 def test_the_rates_of_1989_with_the_tolerance_that_fits():
-    """Printed: 48 % by residual parallax, 45 % by Grubbs besides, 7 % missed; 0.045 mm is that of the described pairs."""
+    """Printed: 48 % by residual parallax, 45 % by Grubbs besides, 7 % missed; 0.045 mm fits the described pairs."""
     results = burshtynskaya1989.run(340)
     counts = next(one.total for one in results.runs if one.eps4 == 0.045 and not one.noise)
     for part, percent in ((counts.by_parallax, 48), (counts.by_grubbs, 45), (counts.missed, 7)):

@@ -125,9 +125,9 @@ TABLE_1 = {
 def test_points_rejected_from_table_1(name):
     """The algorithm proposed in 1971 names the wrong points of the paper's pairs up to n = 9, and then no more.
 
-    At n = 8 points 8 and 4 are equal to 0.0001 mm after one correction, 8 being the larger. At n = 10 four points go, of
-    which three are good, and the operator is called. With n = 16 all wrong points go, and the good point 5 with them;
-    only the third algorithm rejects exactly the wrong ones. Grubbs' test sees one error, and none of several.
+    At n = 8 points 8 and 4 are equal to 0.0001 mm after one correction, 8 being the larger. At n = 10 four points go,
+    of which three are good, and the operator is called. With n = 16 all wrong points go, and the good point 5 with
+    them; only the third algorithm rejects exactly the wrong ones. Grubbs' test sees one error, and none of several.
     """
     sizes = TABLE_1[name]
     mask, order, log = decided(PROCEDURES[name], jaxro.stack([problems.table_1(n) for n in sizes]))
@@ -191,9 +191,9 @@ def test_three_m_q_rejects_nothing_where_the_mean_does():
 
 
 def test_three_m_q_rejects_nothing_up_to_sixteen_points():
-    """|q| of a point is at most m_q sqrt((n - 5) r), r its redundancy number: below 3 m_q on every layout of the papers.
+    """|q| of a point is at most m_q sqrt((n - 5) r), r its redundancy number: below 3 m_q on the papers' layouts.
 
-    An error of 5 m, the largest possible share of [qq]: q² / m_q² = (n - 5) r then.
+    The bound is reached where this point alone has an error, and so an error of 0.5 mm at any of 16 points stays.
     """
     for name, layout in simulation.STANDARD_LAYOUTS.items():
         a = oracles.first_order(layout.zone) if name != "eight rows" else None
@@ -224,11 +224,12 @@ def test_grubbs_at_eight_points():
     clean_pairs = jax.vmap(lambda key: simulation.noisy(flat, key, 0.01))(keys)
     wrong = jax.vmap(lambda pair: simulation.planted(pair, y_right=0.15 * (jnp.arange(8) == 6)))(clean_pairs)
     _, order, _ = decided(PROCEDURES["grubbs"], clean_pairs)
-    mask, found, _ = decided(PROCEDURES["grubbs"], wrong)
-    alarms, named = np.mean(np.any(order > 0, axis=1)), np.mean(~mask[:, 6])
-    first = np.mean(found[:, 6] == 1)
-    print(f"{alarms:.3f} {named:.3f} {first:.3f}")
-    assert alarms < 0.5
+    mask, _, _ = decided(PROCEDURES["grubbs"], wrong)
+    alarms, named = (
+        np.mean(np.any(order > 0, axis=1)),
+        np.mean(np.all(mask == ((np.arange(PLACES) < 8) & (np.arange(PLACES) != 6)), axis=1)),
+    )
+    assert alarms < 0.5 and named < 0.95, (alarms, named)
 
 
 def test_first_algorithm_rejects_the_good_neighbour():

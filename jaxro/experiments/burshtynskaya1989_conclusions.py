@@ -1,7 +1,7 @@
 """The six conclusions of Burshtynskaya and Tumskaya (1989), simulated.
 
-One error a pair at each of the sixteen points in turn, two equal errors at every two points of a zone, and pairs
-without an error; normal errors of 0.01 mm in all four coordinates. The paper's own pairs had no noise.
+One error a pair at each of the sixteen points in turn, two errors of equal size, of equal and of opposite
+sign, at every two points of a zone, and pairs without an error; normal errors of 0.01 mm in all four coordinates. The paper's own pairs had no noise.
 """
 
 from dataclasses import dataclass
@@ -55,7 +55,8 @@ def plan() -> Plan:
     """All pairs: single errors, two errors in a zone, none."""
     points = np.eye(len(ZONES))
     single = [size * points[i] for size in SIZES for i in range(len(ZONES))]
-    double = [SMALL * (points[i] + points[j]) for i, j in combinations(range(len(ZONES)), 2) if ZONES[i] == ZONES[j]]
+    same_zone = [(i, j) for i, j in combinations(range(len(ZONES)), 2) if ZONES[i] == ZONES[j]]
+    double = [SMALL * (points[i] + sign * points[j]) for i, j in same_zone for sign in (1, -1)]
     return Plan(np.concatenate([np.repeat(single + double, DRAWS, axis=0), np.zeros((CLEAN, len(ZONES)))]))
 
 
@@ -71,7 +72,7 @@ class Conclusions:
 
     1 `by_size`: single errors rejected by parallax, by size.
     2 `outer`, `middle`: single errors of 0.1 mm in zones 3 to 6, and in zones 1 and 2.
-    3 `two_in_the_middle`: of two equal errors of 0.1 mm in zone 1 or 2; beside `middle`.
+    3 `two_in_the_middle`: of two errors of 0.1 mm in zone 1 or 2, whatever their signs; beside `middle`.
     4 `neighbour`: of pairs with one error, by size, those that lose this point and a good point of its zone.
     5 `instead_single`, `instead_double`: pairs that lose a good point of the zone while an error there stays.
     6 `by_parallax`, `with_grubbs`: single errors of 0.1 mm rejected by the first and by either stage;

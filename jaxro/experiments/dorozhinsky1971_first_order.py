@@ -49,7 +49,7 @@ def coefficients(zones: Sequence[int], f: float, b: float, y: float) -> np.ndarr
     return np.array(rows)
 
 
-def averaged(zones: Sequence[int], q: Sequence[float], f: float = 1.0, b: float = 1.0, y: float = 1.0) -> np.ndarray:
+def averaged(zones: Sequence[int], q: np.ndarray, f: float = 1.0, b: float = 1.0, y: float = 1.0) -> np.ndarray:
     """alpha, chi, omega', alpha', chi' by the paper's means: equations (6), (8), (6') and (7')."""
     of = {zone: [v for z, v in zip(zones, q, strict=True) if z == zone] for zone in ZONES}
     tilts, omegas = [], []
