@@ -1,7 +1,8 @@
 """The six conclusions of Burshtynskaya and Tumskaya (1989), simulated.
 
-One error a pair at each of the sixteen points in turn, two errors of equal size, of equal and of opposite
-sign, at every two points of a zone, and pairs without an error; normal errors of 0.01 mm in all four coordinates. The paper's own pairs had no noise.
+One error a pair at each of the sixteen points in turn; two errors of equal size, of equal and of opposite sign, at
+every two points of a zone; pairs without an error. Normal errors of 0.01 mm in all four coordinates. The paper's own
+pairs had no noise.
 """
 
 from dataclasses import dataclass
