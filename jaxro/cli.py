@@ -163,14 +163,15 @@ def colmap(
 @app.command()
 def compare(
     file: Annotated[
-        Path | None, given.file("Its first pair is the layout; without it sixteen points in eight rows, f = b = 70 mm.")
+        Path | None,
+        given.file("Its first pair is the layout; without it 16 points in eight rows, and 8 points."),
     ] = None,
     procedure: Annotated[
         list[str] | None,
         typer.Option(help="As often as wanted.  [default: every procedure]", metavar="NAME", show_default=False),
     ] = None,
     errors: Annotated[str, typer.Option(help="Numbers of wrong points.", metavar="N,N,...")] = "0,1,2,3",
-    size: Annotated[str, typer.Option(help="Sizes of their errors, in sigma.", metavar="K,K,...")] = "8,10,15",
+    size: Annotated[str, typer.Option(help="Sizes of their errors, in sigma.", metavar="K,K,...")] = "4,6,8,10,15",
     trials: Annotated[int, typer.Option(help="Simulated pairs in every setting.", metavar="T")] = 1000,
     false_alarms: Annotated[
         float,

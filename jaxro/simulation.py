@@ -36,8 +36,11 @@ ZONES: dict[int, tuple[float, float]] = {
 TABLE_1_ZONES = (1, 2, 3, 4, 5, 6, 3, 4, 5, 6, 1, 2, 4, 3, 5, 1)
 """Zones of the points 1 to 16 in table 1 of Dorozhinsky (1971); its n = 6, 7, 8, 9, 10 are the first n of them."""
 
-ROWS_1989 = (1.0, 0.85, 0.7, 0.1, -0.1, -0.7, -0.85, -1.0)
-"""y of the eight rows, two points a row, of the 16-point layout of Burshtynskaya and Tumskaya (1989)."""
+ROWS_1989 = (1.0, 0.9, 0.6, 0.1, -0.1, -0.6, -0.9, -1.0)
+"""y of the eight rows, two points a row, of the 16-point layout of Burshtynskaya and Tumskaya (1989).
+
+The figure of the layout is lost. With these rows one tolerance reproduces all three pairs that the text describes.
+"""
 
 
 class Layout(NamedTuple):

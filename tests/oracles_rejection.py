@@ -86,15 +86,18 @@ def worst_point(points, focal, eps=0.01):
     return verdict(n, rounds)
 
 
-def dorozhinsky(points, focal, eps1=7.0, eps2=1e-4, eps3=0.1, eps4=0.01):
-    """1971, the algorithm proposed, steps 1 to 5 with eqs (11) to (13)."""
+def dorozhinsky(points, focal, eps1=7.0, eps2=1e-4, eps3=0.1, eps4=0.01, corrections=1):
+    """1971, the algorithm proposed, steps 1 to 5 with eqs (11) to (13).
+
+    Its two iterations are one correction of the elements: the first iteration is at zero elements.
+    """
     n = points.shape[1]
     q = np.abs(oracles.y_parallax(ZERO, points, focal))
     rounds = [np.flatnonzero(q > eps1)]
     used = list(np.flatnonzero(q <= eps1))
     while True:
         here = points[:, used]
-        elements = iterated(here, focal, ZERO, iterations=2)
+        elements = iterated(here, focal, ZERO, iterations=corrections)
         q = np.abs(oracles.y_parallax(elements, here, focal))
         if np.mean(q) <= eps3:
             break

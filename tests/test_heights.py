@@ -158,6 +158,25 @@ def test_every_cell_of_the_table_has_its_printed_digit_but_for_the_misprints(pap
     np.testing.assert_allclose(accuracy.height_terms(1500.0, 7.5, -0.8, 200.0, 0.007, 10.0, 0.02)[2], 0.6, atol=0.05)
     np.testing.assert_allclose(1500 * 0.0085 / (7.5 - 1.6 + 0.64 / 7.5), 2.1, atol=0.05)
     assert paper.cells[1, "readings"][3] > 0.745
+    # case 1, differences at the largest base: 7 um in place of 8.5 gives the printed 1.5, and its total follows
+    np.testing.assert_allclose(3500 * 0.007 / 16.7, 1.467, atol=5e-4)
+    np.testing.assert_allclose(paper.cells[0, "readings"][3], 3500 * 0.0085 / 16.7, rtol=1e-12)
+    assert round(float(np.hypot(1.467, np.hypot(0.1, 0.1))), 1) == case_1_total(gutkin1982) == 1.5
+
+
+def case_1_total(paper):
+    return paper.CASES[0].printed["total"][3]
+
+
+def test_the_difference_of_the_experiment_is_a_mixture_of_both_kinds_of_legs(paper):
+    """1.40 mm lies above 1.0 (5.6 um, one square) and below 1.52 (8.5 um, two squares); simulated, 7 % more: the model
+    lies 67 mm below the grid, where (11) takes H for H - h."""
+    closed = [accuracy.by_base(2100.0, 75.0, 2100 / 6.4, m) for m in (0.0056, 0.0085)]
+    np.testing.assert_allclose(closed, [1.0, 1.52], atol=0.01)
+    np.testing.assert_allclose(paper.legs, np.array(closed) * (2167 / 2100) ** 2, rtol=0.02)
+    assert paper.legs[0] < 1.40 < paper.legs[1] == paper.experiment[0, 1]
+    for p_c_part in (0.003, 0.004):
+        assert 0.008 < np.sqrt(0.0056**2 + 0.0054**2 + p_c_part**2) < 0.009
 
 
 def test_figures_of_the_text():

@@ -7,6 +7,7 @@ import problems
 import pytest
 
 from jaxro import DependentElements, IndependentElements, coplanarity, pad, simulation
+from jaxro.experiments import dorozhinsky1971_first_order as first_order
 
 # Dewitt's program on its own sample: photo residuals and object coordinates, Z counted from f below the left station
 DEWITT_RESIDUALS = """
@@ -134,7 +135,7 @@ def test_table_2_steps_are_those_of_the_oracle():
         np.testing.assert_allclose(by_parallax(pair, max_steps=k).elements.values(), judge[k - 1], atol=1e-12)
 
 
-# exact least squares in 36ths of the error at the last point; the paper's averaged solution beside it
+# exact least squares in 36ths of the error at point 7
 EQUATION_9 = (3.13, -3.13, -1.57, -17.22, -1.57, 1.57, 18.78)
 EQUATION_10 = (-3.27, 3.27, -17.18, -0.82, 1.64, -1.64, 18.82, -0.82)
 
@@ -157,16 +158,58 @@ def test_first_order_distribution_of_one_error(zones, wrong, exact):
     np.testing.assert_allclose(36e5 * found.parallax, exact, atol=0.006)
 
 
-def test_equation_9_is_the_papers_averaged_solution():
-    """Errors of the elements by (8) and (7') put into (5) and (7), in 36ths of the error at point 7.
+PAPERS_RULE = {9: (0, -2, -6, -17, -6, 1, 19), 10: (-3, 3, -16.5, -1.5, 1.5, -1.5, 19.5, -1.5)}
+"""36ths of the error at point 7: the paper's averages put into its equations (5) and (7)."""
 
-    Points 1, 3, 4, 6, 7 come out as printed (0, -6, -17, 1, 19). At points 2 and 5 the print has 4 and 6 where its own
-    equations give -2 and -6. Exact least squares (above) differs from either.
+
+@pytest.mark.parametrize("equation", PAPERS_RULE)
+def test_equations_9_and_10_by_the_papers_own_rule(equation):
+    """What the rule gives differs from the print in its misprints alone: v2 and v5 of (9), the sign of v5 of (10)."""
+    zones, printed = first_order.EQUATIONS[equation]
+    q = np.eye(len(zones))[6]
+    v = oracles.first_order(zones) @ first_order.averaged(zones, q) + q
+    np.testing.assert_allclose(36 * v, PAPERS_RULE[equation], atol=1e-12)
+    np.testing.assert_allclose(first_order.by_the_papers_rule(equation), PAPERS_RULE[equation], atol=1e-12)
+    differing = np.flatnonzero(~np.isclose(36 * v, printed)) + 1
+    assert list(differing) == {9: [2, 5], 10: [5]}[equation]
+
+
+def test_the_printed_equation_9_belongs_to_no_elements():
+    """Points 3 and 5 differ by alpha' alone, which the paper's (8) leaves at zero; the print has -6 and 6.
+
+    With no restriction at all the printed vector is off the space of the five columns as well.
     """
-    alpha, chi, omega, alpha_right, chi_right = -1 / 4, 1 / 6 * (1 - 1 / 3), 1 / 6, 0, 1 / 6
-    v = oracles.first_order((1, 2, 3, 4, 5, 6, 4)) @ [alpha, chi, omega, alpha_right, chi_right]
-    v[6] += 1
-    np.testing.assert_allclose(36 * v, [0, -2, -6, -17, -6, 1, 19], atol=1e-12)
+    zones, printed = first_order.EQUATIONS[9]
+    design = oracles.first_order(zones)
+    change = np.array(printed) / 36 - np.eye(7)[6]
+    left = change - design @ np.linalg.pinv(design) @ change
+    assert np.max(np.abs(left)) > 0.05
+    own = first_order.by_the_papers_rule(9) / 36 - np.eye(7)[6]
+    np.testing.assert_allclose(own - design @ np.linalg.pinv(design) @ own, 0, atol=1e-12)
+    np.testing.assert_allclose(design[4] - design[2], [0, 0, 0, -2, 0])
+
+
+def test_equations_6_7_and_8_for_any_focal_length_base_and_y():
+    """(8), (7') for the error at point 7, (6') for any parallaxes; (6) solves the six equations (5) but for omega'."""
+    f, b, y = 152.0, 71.0, 83.0
+    zones, _ = first_order.EQUATIONS[9]
+    alpha, chi, omega, alpha_right, chi_right = first_order.averaged(zones, np.eye(7)[6], f, b, y)
+    np.testing.assert_allclose(alpha, -f / (4 * b * y))
+    np.testing.assert_allclose(omega, f / (6 * y * y))
+    np.testing.assert_allclose([alpha_right, chi_right], [0, f / b * omega])
+    np.testing.assert_allclose(chi, (f**2 / y**2 - 1 / 3) / (6 * b))
+    q = np.array([0.3, -0.2, 0.5, 0.1, -0.4, 0.7, 0.2])
+    _, chi, omega, *_ = first_order.averaged(zones, q, f, b, y)
+    printed = (f / b + 2 * y * y / (3 * f * b)) * omega - (q[3] + 2 * q[1] + 2 * q[5] + q[6]) / (6 * b)
+    np.testing.assert_allclose(chi, printed)
+    # equation (7): the residual of a seventh point without an error is that of point 4, its neighbour
+    a = first_order.coefficients(zones, f, b, y)
+    np.testing.assert_array_equal(a[6], a[3])
+    # six parallaxes that five elements cause are explained by (6) exactly
+    true = np.array([0.01, -0.02, 0.03, 0.015, -0.005])
+    six = zones[:6]
+    a = first_order.coefficients(six, f, b, y)
+    np.testing.assert_allclose(first_order.averaged(six, -a @ true, f, b, y), true, rtol=1e-12)
 
 
 def test_three_m_q_rejects_nothing():

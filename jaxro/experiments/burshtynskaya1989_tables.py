@@ -3,7 +3,8 @@
 from dataclasses import astuple
 from typing import TYPE_CHECKING
 
-from .burshtynskaya1989 import NAMED, PAPER, Results, Run
+from .burshtynskaya1989 import NAMED, PAPER, TOLERANCES, Results, Run, common
+from .burshtynskaya1989_conclusions import described
 from .tables import table
 
 if TYPE_CHECKING:
@@ -35,6 +36,13 @@ def tables(results: Results) -> "list[str | Table]":
         _by_class(results),
         "Pairs that the text describes: points rejected by residual parallax; by Grubbs",
         _named(results),
+        "Tolerances eps4 (mm) with which the first stage rejects just the points that the text names, by the rows of "
+        "the layout (its figure is lost)",
+        _fitting(results),
+        f"The six conclusions, simulated with noise of 0.01 mm, eps4 = {TOLERANCES[-1]:g} mm",
+        _conclusions(results),
+        "The legible part of table 1 contradicts the classes: I-4 and I-5 have 0.02 mm (2 sigma), III-1 has 0.2 mm (20 "
+        "sigma). 'Critical region v < v_q' is the acceptance region; the paper does not give its level.",
     ]
 
 
@@ -69,6 +77,27 @@ def _named(results: Results) -> "Table":
         errors = ", ".join(f"{point} {error:+g}" for point, error in variant.errors.items())
         found = ["; ".join(map(listed, of[name])) for of in results.named.values()]
         rows.add_row(name, errors, listed(variant.rejected), *found)
+    return rows
+
+
+def _fitting(results: Results) -> "Table":
+    rows = table("rows y/b", *NAMED, "all three", left=1)
+    for layout, intervals in results.fitting.items():
+        rows.add_row(layout, *(_interval(i) for i in intervals.values()), _interval(common(intervals.values())))
+    return rows
+
+
+def _interval(limits: tuple[float, float]) -> str:
+    above, up_to = limits
+    return f"{above:.4f}-{up_to:.4f}" if above < up_to else "none"
+
+
+def _conclusions(results: Results) -> "Table":
+    rows = table("the paper", "simulated", "", left=3)
+    for column in rows.columns:
+        column.no_wrap = False
+    for cells in described(results.conclusions):
+        rows.add_row(*cells)
     return rows
 
 

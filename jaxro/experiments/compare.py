@@ -28,6 +28,9 @@ from ..results import is_usable
 from ..simulation import noisy, planted
 from .calibration import Calibration, adjustable, calibrated
 
+LEAST = 6
+"""Good points that a pair has at least."""
+
 
 class Setting(NamedTuple):
     """A layout by its name, a number of wrong points and the size of their errors (sigma; 0 where there are none)."""
@@ -48,10 +51,12 @@ class Estimate(NamedTuple):
 class Score:
     """What one procedure did in one setting; shares are of 1.
 
-    `found`: wrong points rejected. `lost`: good points rejected. `perfect`: pairs left with exactly their good points.
-    `alarms`: pairs that lost a good point; without errors, the false alarms. `unfinished`: pairs with another outcome
-    than finished. `angle`: root mean square of the angle to the truth (arc minutes), of the rotation or the base,
-    whichever is larger, over the pairs with a usable orientation. `calibrated`: at the common share of false alarms.
+    `found`: wrong points named, the probability that a wrong point is rejected. `misnamed`: pairs in which the first
+    rejection takes a good point. `lost`: good points rejected. `perfect`: pairs named exactly, that is, left with all
+    of their good points and no other. `alarms`: pairs that lost a good point; without errors, the false alarms.
+    `unfinished`: pairs with another outcome than finished. `angle`: root mean square of the angle to the truth (arc
+    minutes), of the rotation or the base, whichever is larger, over the pairs with a usable orientation. `calibrated`:
+    at the common share of false alarms.
     """
 
     setting: Setting
@@ -59,6 +64,7 @@ class Score:
     calibrated: bool
     trials: int
     found: Estimate
+    misnamed: Estimate
     lost: Estimate
     perfect: Estimate
     alarms: Estimate
@@ -80,13 +86,13 @@ def compare(
     procedures: Mapping[str, AbstractProcedure],
     *,
     errors: Sequence[int] = (0, 1, 2, 3),
-    sizes: Sequence[float] = (8.0, 10.0, 15.0),
+    sizes: Sequence[float] = (4.0, 6.0, 8.0, 10.0, 15.0),
     trials: int = 1000,
     seed: int = 0,
     false_alarms: float = 0.05,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Comparison:
-    """Every procedure in every setting.
+    """Every procedure in every setting that leaves a layout `LEAST` good points.
 
     `layouts`: errorless pairs by name; their sigma is that of the simulated coordinates, known to the procedures.
     `false_alarms`: share of pairs without errors that the calibrated procedures spoil; 0 leaves that comparison out.
@@ -94,7 +100,11 @@ def compare(
     """
     settable = [name for name, procedure in procedures.items() if false_alarms and adjustable(procedure)]
     kinds = [(n, s) for n in errors for s in (sizes if n else (0.0,))]
-    total = len(layouts) * (len(settable) + len(kinds) * (len(procedures) + len(settable)))
+    possible = {
+        name: [kind for kind in kinds if kind[0] <= int(exact.count) - LEAST] for name, exact in layouts.items()
+    }
+    runs = sum(map(len, possible.values()))
+    total = len(layouts) * len(settable) + runs * (len(procedures) + len(settable))
     done = 0
 
     def step(count: int = 1) -> None:
@@ -113,7 +123,7 @@ def compare(
                 known[name] = calibrated(procedure, clean, false_alarms)
                 step(name in settable)
         tuned = {name: c.procedure for name, c in known.items() if c.procedure is not None}
-        for kind in kinds:
+        for kind in possible[layout]:
             setting = Setting(layout, *kind)
             pairs, wrong = simulated(exact, setting, trials, seed)
             for name in procedures:
@@ -148,13 +158,14 @@ def _simulated(plan: tuple):
 
 def _judged(procedure: AbstractProcedure, pairs: Pair, wrong: np.ndarray, truth: RelativePose) -> tuple[Estimate, ...]:
     """The estimates of a `Score`, in its order."""
-    kept, pose, usable, finished = clean_batch(pairs, procedure, select=_seen)
+    kept, order, pose, usable, finished = clean_batch(pairs, procedure, select=_seen)
     angle, usable = np.asarray(Program(_angles, {}, QUICK)((truth, pose))), np.asarray(usable)
     out = np.asarray(pairs.mask & ~kept)
     good = np.asarray(pairs.mask) & ~wrong
     share = lambda part, whole: np.sum(part, axis=1) / np.where(np.any(whole, axis=1), np.sum(whole, axis=1), np.nan)
     return (
         estimate(share(out & wrong, wrong)),
+        estimate(np.any((np.asarray(order) == 1) & good, axis=1)),
         estimate(share(out & good, good)),
         estimate(np.all(out == wrong, axis=1)),
         estimate(np.any(out & good, axis=1)),
@@ -165,7 +176,7 @@ def _judged(procedure: AbstractProcedure, pairs: Pair, wrong: np.ndarray, truth:
 
 def _seen(found: Rejection):
     o = found.orientation
-    return found.mask, o.pose, is_usable(o.result), found.outcome == OUTCOMES.finished
+    return found.mask, found.order, o.pose, is_usable(o.result), found.outcome == OUTCOMES.finished
 
 
 def _angles(truth_and_poses: tuple[RelativePose, RelativePose]):

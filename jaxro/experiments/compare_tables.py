@@ -14,7 +14,11 @@ if TYPE_CHECKING:
 
 
 def tables(comparison: Comparison) -> "Iterator[str | Table]":
-    """What `jaxro compare` prints: for every layout the procedures as they are, then at equal false alarms."""
+    """What `jaxro compare` prints: for every layout the procedures as they are, then at equal false alarms.
+
+    found: wrong points named. good first: pairs in which the first rejection takes a good point. exactly: pairs from
+    which all wrong points are rejected and no other.
+    """
     for layout, scores in groupby(comparison.scores, key=lambda s: s.setting.layout):
         here = list(scores)
         yield f"{layout}, {here[0].trials} pairs a row; % of points or pairs ± standard error; angle to the truth, rms"
@@ -42,12 +46,12 @@ def _clean(scores: list[Score]) -> "Table":
 
 
 def _spoiled(scores: list[Score]) -> "Table":
-    rows = table("errors", "procedure", "found", "good lost", "all right", "undone", "angle [']", left=2)
+    rows = table("errors", "procedure", "found", "good first", "good lost", "exactly", "undone", "angle [']", left=2)
     for setting, members in groupby(scores, key=lambda s: s.setting):
         rows.add_section()
         title = f"{setting.errors} x {setting.size:g}σ"
         for s in members:
-            shares = map(_percent, (s.found, s.lost, s.perfect, s.unfinished))
+            shares = map(_percent, (s.found, s.misnamed, s.lost, s.perfect, s.unfinished))
             rows.add_row(title, s.procedure, *shares, _angle(s))
             title = ""
     return rows

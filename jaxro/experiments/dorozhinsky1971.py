@@ -17,10 +17,11 @@ from jaxtyping import Array, Float
 from .. import simulation
 from ..batch import clean_batch
 from ..elements import IndependentElements
-from ..pairs import Pair
+from ..pairs import Pair, pad, stack
 from ..programs import QUICK, Program
 from ..rejection import OUTCOMES, Dorozhinsky, base
 from ..rejection.leave_one_out_grubbs import linearised
+from .dorozhinsky1971_first_order import EQUATIONS, by_the_papers_rule
 
 ERRORS = (0.0, 0, 0, 0, 0, 0, 2.0, 2.2, -2.43, -1.90, 0, 0, 0, 0, -0.60, 2.1)
 """mm, behind table 1."""
@@ -53,75 +54,113 @@ TABLE_2_ELEMENTS = (
 """alpha, chi, alpha', omega', chi' in arc minutes."""
 IN_THE_ORDER_OF_THE_PAPER = (0, 1, 3, 2, 4)
 
-EQUATIONS = {
-    9: ((1, 2, 3, 4, 5, 6, 4), (0, 4, -6, -17, 6, 1, 19)),
-    10: ((1, 2, 3, 4, 5, 6, 3, 4), (-3, 3, -16.5, -1.5, 1.5, -1.5, 19.5, -1.5)),
-}
-"""Zones of the points, and the residuals that an error of point 7 leaves, in 36ths of it, as printed."""
+TEN_POINTS = (13, -20, -94, 11, -9, 10, -98, -20, 11, -9)
+"""Residuals of the ten points in the introduction, as printed: an error at point 7, in the zone of point 3.
+
+The error is printed as -2.0 mm and is +2.0 mm in the sign of table 1; so -94 at point 3 stands for 94.
+"""
+TEN_ZONES = (1, 2, 3, 4, 5, 6, 3, 2, 4, 5)
+TEN_TOLERANCE = 0.01
+"""mm, of condition (3)."""
+
+READINGS = (1, 2)
+"""Corrections of the elements before a point is judged. The paper's "two iterations" are one correction, as its table 2
+says; two corrections are the other reading of its text."""
+NOISY, NOISE = 150, 0.01
+"""Pairs of eight points with errors of 2.0 and 2.2 mm at points 7 and 8 and noise (mm) in all coordinates."""
 
 EXAMPLE = (0.01,) * 9 + (0.10,)
 """mm; the paper rounds m_q to .045 and 3 m_q to .13."""
 
 
 @dataclass(frozen=True)
-class Column:
-    """One number of points of table 1: residuals (mm), and what the proposed algorithm does with them.
+class Decision:
+    """What the proposed algorithm did: numbers of the points rejected, in order; mean |q| of those kept (mm)."""
 
-    `rejected`: numbers of the points in order; `left`: mean |q| of those kept.
-    """
+    rejected: list[int]
+    left: float
+    outcome: str
+
+
+@dataclass(frozen=True)
+class Column:
+    """One number of points of table 1: residuals (mm), and the decision by the number of corrections."""
 
     points: int
     parallax: np.ndarray
     m_q: float
-    rejected: list[int]
-    left: float
-    outcome: str
+    decisions: dict[int, Decision]
 
     @property
     def wrong(self) -> list[int]:
         """Numbers of the points with an error."""
         return [int(i) + 1 for i in np.flatnonzero(ERRORS[: self.points])]
 
-    @property
-    def missed(self) -> list[int]:
-        """Wrong points kept."""
-        return [i for i in self.wrong if i not in self.rejected]
-
-    @property
-    def lost(self) -> list[int]:
-        """Good points rejected."""
-        return [i for i in self.rejected if i not in self.wrong]
-
 
 @dataclass(frozen=True)
 class Results:
-    """Everything calculated: mm, arc minutes, 36ths."""
+    """Everything calculated: mm, arc minutes, 36ths.
+
+    `pair_of_table_2`: decisions on the pair of table 2, whose points 7 and 8 are wrong. `named_exactly`: share of the
+    noisy pairs of eight points from which exactly points 7 and 8 were rejected. Both by the number of corrections.
+    `least_squares`, `own_rule`: residuals of (9) and (10). `ten`: residuals of the ten points of the introduction, of
+    which condition (3) rejects `ten_rejected`.
+    """
 
     columns: list[Column]
     parallax: np.ndarray
     elements: np.ndarray
-    exact: dict[int, np.ndarray]
+    pair_of_table_2: dict[int, Decision]
+    named_exactly: dict[int, float]
+    least_squares: dict[int, np.ndarray]
+    own_rule: dict[int, np.ndarray]
+    ten: np.ndarray
+    ten_rejected: list[int]
     m_q: float
 
 
 def run() -> Results:
-    """Calculate all of it; nothing here is random."""
+    """Calculate all of it; the noisy pairs have a fixed seed."""
     pairs, strict, (parallax, elements), influence = Program(_calculated, {}, QUICK)(jnp.asarray(ERRORS))
+    q, m_q = map(np.asarray, strict)
+    decisions = {corrections: _decisions(pairs, corrections) for corrections in READINGS}
+    by_row = lambda row: {corrections: found[row] for corrections, found in decisions.items()}
+    columns = [Column(n, q[row, :n], float(m_q[row]), by_row(row)) for row, n in enumerate(TABLE_1)]
+    second, ten, noisy = len(TABLE_1), len(TABLE_1) + 1, len(TABLE_1) + 2
+    exactly = {
+        corrections: float(np.mean([set(one.rejected) == {7, 8} for one in found[noisy:]]))
+        for corrections, found in decisions.items()
+    }
     in_minutes = np.rad2deg(np.asarray(elements)) * 60
+    ten_q = q[ten, : len(TEN_ZONES)]
+    too_large = np.abs(ten_q) - np.mean(np.abs(ten_q)) >= TEN_TOLERANCE
     return Results(
-        _columns(pairs, *map(np.asarray, strict)),
-        np.asarray(parallax),
-        in_minutes[:, list(IN_THE_ORDER_OF_THE_PAPER)],
-        {equation: 36 * np.asarray(influence[equation]) for equation in EQUATIONS},
-        float(np.sqrt(np.sum(np.square(EXAMPLE)) / (len(EXAMPLE) - 5))),
+        columns=columns,
+        parallax=np.asarray(parallax),
+        elements=in_minutes[:, list(IN_THE_ORDER_OF_THE_PAPER)],
+        pair_of_table_2=by_row(second),
+        named_exactly=exactly,
+        least_squares={equation: 36 * np.asarray(influence[equation]) for equation in EQUATIONS},
+        own_rule={equation: by_the_papers_rule(equation) for equation in EQUATIONS},
+        ten=ten_q,
+        ten_rejected=[int(i) + 1 for i in np.flatnonzero(too_large)],
+        m_q=float(np.sqrt(np.sum(np.square(EXAMPLE)) / (len(EXAMPLE) - 5))),
     )
 
 
 def _calculated(errors):
-    """The pairs of table 1 as a batch, their strict solutions, the iterations of table 2, and the influences."""
+    """All pairs as a batch, their strict solutions, the iterations of table 2, and the influences.
+
+    The batch: table 1, the pair of table 2, the ten points of the introduction, the noisy pairs.
+    """
     most = table_1(errors)
     masks = jnp.arange(max(TABLE_1))[None, :] < jnp.array(list(TABLE_1))[:, None]
-    pairs = jax.vmap(most.with_mask)(masks)
+    first = jax.vmap(most.with_mask)(masks)
+    two = pad(table_1(errors[:8]), max(TABLE_1))
+    keys = jax.random.split(jax.random.key(1971), NOISY)
+    noisy = jax.vmap(lambda key: simulation.noisy(two, key, NOISE))(keys)
+    single = [pad(one, max(TABLE_1)) for one in (table_2(), ten_points())]
+    pairs = jax.tree.map(lambda *parts: jnp.concatenate(parts), first, stack(single), noisy)
     return (
         pairs,
         jax.vmap(_strict)(pairs),
@@ -130,9 +169,16 @@ def _calculated(errors):
     )
 
 
+def ten_points() -> Pair:
+    """The ten points of the introduction, an error of +2.0 mm at point 7."""
+    x, y = zip(*(simulation.ZONES[zone] for zone in TEN_ZONES), strict=True)
+    flat = simulation.mock_pair(simulation.Layout(x, y, TEN_ZONES))
+    return simulation.planted(flat, y_right=2.0 * (np.arange(len(TEN_ZONES)) == 6))
+
+
 def table_1(errors: Float[Array, "point"]) -> Pair:
-    """The mock pair of table 1 with all its points."""
-    return simulation.planted(simulation.mock_pair(simulation.standard_layout(max(TABLE_1))), y_right=errors)
+    """The mock pair of table 1 with as many points as errors are given."""
+    return simulation.planted(simulation.mock_pair(simulation.standard_layout(len(errors))), y_right=errors)
 
 
 def table_2() -> Pair:
@@ -144,16 +190,16 @@ def table_2() -> Pair:
     return simulation.planted(flat, y_right=np.array([0, 0, 0, 0, 0, 0, 1.10, 1.20]))
 
 
-def _columns(pairs: Pair, q: np.ndarray, m_q: np.ndarray) -> list[Column]:
-    order, left, outcome = map(np.asarray, clean_batch(pairs, Dorozhinsky(), select=_decided))
+def _decisions(pairs: Pair, corrections: int) -> list[Decision]:
+    found = clean_batch(pairs, Dorozhinsky(corrections=corrections), select=_decided)
+    order, q, kept, outcome = map(np.asarray, found)
     names = {int(item._value): name for name, item in OUTCOMES._name_to_item.items()}
-    columns = []
-    for row, points in enumerate(TABLE_1):
+    decisions = []
+    for row in range(len(order)):
         rejected = sorted(np.flatnonzero(order[row]), key=lambda i, row=row: order[row, i])
-        mean = float(np.sum(np.abs(left[row])) / (points - len(rejected)))
-        numbers = [int(i) + 1 for i in rejected]
-        columns.append(Column(points, q[row, :points], float(m_q[row]), numbers, mean, names[int(outcome[row])]))
-    return columns
+        mean = float(np.sum(np.abs(q[row][kept[row]])) / np.sum(kept[row]))
+        decisions.append(Decision([int(i) + 1 for i in rejected], mean, names[int(outcome[row])]))
+    return decisions
 
 
 def _strict(pair: Pair):
@@ -162,7 +208,7 @@ def _strict(pair: Pair):
 
 
 def _decided(r):
-    return r.order, r.orientation.parallax, r.outcome._value
+    return r.order, r.orientation.parallax, r.mask, r.outcome._value
 
 
 def _iterations(pair: Pair):

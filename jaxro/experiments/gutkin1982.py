@@ -64,8 +64,8 @@ CASES = (
 MISPRINTS = {
     (0, "m_pc", 0): "misprint for 0.069, which the text has",
     (0, "m_pc", 2): "misprint for 0.069, which the text has",
-    (0, "readings", 3): "misprint for 1.8",
-    (0, "total", 3): "follows from the misprint 1.5",
+    (0, "readings", 3): "calculated with 7 um in place of 8.5: 1.467; with 8.5 um it is 1.8",
+    (0, "total", 3): "follows from the 1.5 above it",
     (1, "grid parallax", 0): "calculated with m_pc = 0.02, that of L = 200 mm, not with the 0.030 above it",
     (1, "total", 0): "follows from the 0.6 above it",
     (1, "readings", 2): "2.13 with the term dp1 dp2 / p_c of (6) in the denominator",
@@ -89,12 +89,14 @@ class Figure(NamedTuple):
 @dataclass(frozen=True)
 class Results:
     """Cells of the table by (case, row), totals of exact propagation by case, figures of the text, and the experiment:
-    (m_h, m_dh) with the right camera height and with one wrong by 30 mm."""
+    (m_h, m_dh) with the right camera height and with one wrong by 30 mm. `legs`: m_dh of differences within one square
+    (5.6 µm) and between squares (8.5 µm), with the right camera height."""
 
     cells: dict[tuple[int, str], np.ndarray]
     exact: list[np.ndarray]
     figures: list[Figure]
     experiment: np.ndarray
+    legs: tuple[float, float]
 
 
 def run() -> Results:
@@ -103,7 +105,9 @@ def run() -> Results:
     for number, case in enumerate(CASES):
         for row, values in zip(ROWS, _columns(case), strict=True):
             cells[number, row] = values
-    return Results(cells, [_exact(case) for case in CASES], figures(), experiment())
+    simulated, within = experiment()
+    legs = within, float(simulated[0, 1])
+    return Results(cells, [_exact(case) for case in CASES], figures(), simulated, legs)
 
 
 def _columns(case: Case) -> list[np.ndarray]:
@@ -160,6 +164,9 @@ def figures() -> list[Figure]:
     found += [
         Figure("(3') m_hH, h = 100, H = 1500, mm", float(accuracy.by_camera_height(100, 1500, 10)), 0.7, 1),
         Figure("(4) m_hpc, h = 100, p_c = 7.5, mm", float(accuracy.by_grid_parallax(100, 7.5, 0.02)), 0.3, 1),
+        Figure(
+            "m of (6), um: 5.6, 5.4 and 3-4", 1e3 * float(np.sqrt(0.0056**2 + 0.0054**2 + 0.0035**2)), 8.5, 1, "'8-9'"
+        ),
         Figure("(10) p_c, B = H / 4, mm", float(accuracy.parallax_over_plane(FOCAL, 4, 1)), 20, 2, "'about 20'"),
         Figure("(11') H² / x B", float(1 / m), 9000, 0, "rounded"),
         Figure("(11'') H / x, B = H / 4", float(1 / (4 * m)), 2200, 0, "rounded"),
@@ -183,11 +190,12 @@ EXPERIMENT_DEPTH = 2100 / 30 * float(np.sqrt(1.76**2 - 1.48**2))
 DRAWS = 2000
 
 
-def experiment(depth: float = EXPERIMENT_DEPTH) -> np.ndarray:
+def experiment(depth: float = EXPERIMENT_DEPTH) -> tuple[np.ndarray, float]:
     """The paper's experiment as simulation: errors (mm, root mean square) of 22 heights over the grid and of the 21
-    differences of neighbours, without and with an error of 30 mm in the camera height; rows as printed.
+    differences of neighbours, without and with an error of 30 mm in the camera height; rows as printed. And the
+    errors of differences within one square, without it.
 
-    Points 10 mm around the depth, m_dp = 7 µm over the grid, 8.5 µm between points.
+    Points 10 mm around the depth, m_dp = 7 µm over the grid, 8.5 µm between points, 5.6 µm within a square.
     """
     camera, base = EXPERIMENT["camera_height"], EXPERIMENT["base"]
     p_c = float(accuracy.parallax_over_plane(FOCAL, camera, base))
@@ -198,10 +206,16 @@ def experiment(depth: float = EXPERIMENT_DEPTH) -> np.ndarray:
     def one(key, wrong):
         keys = jax.random.split(key)
         over = heights.height(camera + wrong, p_c, dp + M_HEIGHT * jax.random.normal(keys[0], dp.shape, float))
-        read = dp[:-1] + step + M_DIFFERENCE * jax.random.normal(keys[1], step.shape, float)
-        between = heights.difference_in_square(camera + wrong, p_c, dp[:-1], read)
-        return jnp.mean((over - h) ** 2), jnp.mean((between - (h[1:] - h[:-1])) ** 2)
+        drawn = jax.random.normal(keys[1], step.shape, float)
+
+        def square(deviation):
+            read = dp[:-1] + step + deviation * drawn
+            between = heights.difference_in_square(camera + wrong, p_c, dp[:-1], read)
+            return jnp.mean((between - (h[1:] - h[:-1])) ** 2)
+
+        return jnp.mean((over - h) ** 2), square(M_DIFFERENCE), square(M_IN_SQUARE)
 
     keys = jax.random.split(jax.random.key(1982), DRAWS)
     squares = jax.jit(jax.vmap(jax.vmap(one, (0, None)), (None, 0)))(keys, jnp.array([0.0, EXPERIMENT["error"]]))
-    return np.sqrt(np.mean(np.asarray(squares), axis=2)).T
+    roots = np.sqrt(np.mean(np.asarray(squares), axis=2)).T
+    return roots[:, :2], float(roots[0, 2])

@@ -24,6 +24,9 @@ def tables(results: Results) -> "list[str | Table]":
         "The experiment with a model, H = 2100 mm, H:B = 6.4, 22 points; simulated: "
         f"{EXPERIMENT_DEPTH:.0f} mm below the grid, m_dp = 7 µm (h) and 8.5 µm (dh)",
         _experiment(results),
+        f"1.40 mm lies between the differences of legs within one square, {results.legs[0]:.2f} mm (5.6 µm), and those "
+        f"between squares, {results.legs[1]:.2f} mm (8.5 µm): a mixture of both kinds of legs.",
+        "(3) has m_dp where m_H is meant; (12), the limit of a misclosure, is lost.",
         "An error of 30 mm in the camera height enlarges the errors of heights over the grid, not those of "
         "differences.",
     ]

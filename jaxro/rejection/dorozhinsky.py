@@ -1,4 +1,12 @@
-"""The algorithm proposed in 1971, exactly."""
+"""The algorithm proposed in 1971, and the count of its iterations.
+
+The paper asks for two iterations before a point is judged, and says that "the first iteration is the one in which the
+elements are zero". Its table 2 prints under iteration 2 the parallaxes after one correction of the elements, and the
+paper concludes from this table that points are to be rejected after the second iteration. There a wrong point has the
+largest parallax (59 hundredths of mm at point 8, 58 at the good point 4); after two corrections the good point has it.
+So two iterations are one correction from zero elements: `Dorozhinsky()`. `Dorozhinsky(corrections=2)` is the other
+reading, which rejects good points in place of wrong ones in table 1 of the paper.
+"""
 
 import jax.numpy as jnp
 
@@ -27,34 +35,38 @@ from .base import (
 )
 
 CONVERGENCE = 10
-"""Iterations allowed after the last rejection by the mean; three are usual."""
+"""Corrections allowed after the last rejection by the mean; three are usual."""
 
 
 class Dorozhinsky(AbstractProcedure):
     """Five steps (Dorozhinsky 1971, eqs 11 to 13), from zero elements:
 
     1. points with |q| > eps1 go, once;
-    2. `iterations` iterations;
+    2. `corrections` corrections of the elements;
     3. while mean |q| > eps3 the point with the largest |q| goes, and 2 is repeated from zero; with `least` points left
        the outcome is `operator_needed`;
-    4. iterations until no element changes by eps2;
+    4. corrections until no element changes by eps2;
     5. points with |q| - mean |q| >= eps4 go, once, at least `least` stay; new solution.
 
-    The log has a round per iteration: parallaxes before it, elements after it, as in table 2; and one per decision.
+    The log has a round per correction: parallaxes before it, elements after it, as in table 2; and one per decision.
+
+    One correction leaves the terms of second order of the elements in the parallaxes. Where these exceed eps3, the
+    procedure rejects good points or calls the operator: it needs photos that are nearly parallel, or coordinates that
+    were turned by approximate elements.
     """
 
     eps1: float = 7.0
     eps2: float = 1e-4
     eps3: float = 0.1
     eps4: float = 0.01
-    iterations: int = 2
+    corrections: int = 1
     least: int = 6
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = cleaned(pair)[0]
         zero = zero_elements(pair)
         cycles = max(pair.x_left.shape[0] - self.least, 0) + 1
-        history = began(pair, 1 + cycles * (self.iterations + 1) + CONVERGENCE + 1)
+        history = began(pair, 1 + cycles * (self.corrections + 1) + CONVERGENCE + 1)
         first = jnp.abs(parallaxes(pair, pair.mask, zero))
         gross = pair.mask & (first > self.eps1)
         history = recorded(history, Round(first, jnp.asarray(self.eps1), gross, first, values(zero)))
@@ -62,8 +74,8 @@ class Dorozhinsky(AbstractProcedure):
         def cycle(state):
             history, *_ = state
             elements = zero
-            for _ in range(self.iterations):
-                history, elements = self._iteration(pair, history, elements)
+            for _ in range(self.corrections):
+                history, elements = self._correction(pair, history, elements)
             q = parallaxes(pair, history.mask, elements)
             mean = mean_of(jnp.abs(q), history.mask)
             wrong, few = mean > self.eps3, count(history.mask) <= self.least
@@ -79,7 +91,7 @@ class Dorozhinsky(AbstractProcedure):
 
         def converge(state):
             history, elements, _, taken = state
-            history, new = self._iteration(pair, history, elements)
+            history, new = self._correction(pair, history, elements)
             change = jnp.max(jnp.abs(values(new) - values(elements)))
             return history, new, change >= self.eps2, taken + 1
 
@@ -94,7 +106,7 @@ class Dorozhinsky(AbstractProcedure):
         outcome = OUTCOMES.where(stuck, OUTCOMES.operator_needed, finished(pair))
         return ended(history, by_parallax(pair, history.mask, elements), outcome)
 
-    def _iteration(self, pair: Pair, history: History, elements: AbstractElements) -> tuple[History, AbstractElements]:
+    def _correction(self, pair: Pair, history: History, elements: AbstractElements) -> tuple[History, AbstractElements]:
         new = iterated(pair, history.mask, elements)
         q = parallaxes(pair, history.mask, elements)
         none = jnp.zeros_like(history.mask)
