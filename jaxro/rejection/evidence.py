@@ -22,6 +22,7 @@ SHIFTS, TRIALS = 8, 4096
 """Other partners that each point is given: at least so many, more where there are few points, to make so many trials.
 """
 
+
 def chi_squared_limit(deviations: float, freedom: Float[Array, ""]) -> Float[Array, ""]:
     """What chi-squared exceeds as seldom as a normal number so many standard deviations, to a few per cent (Wilson and
     Hilferty 1931)."""

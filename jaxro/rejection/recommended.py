@@ -58,7 +58,7 @@ FADING = 2.5
 """Multiple of the noise at which the weight of a point has faded to a quarter, where the noise is not normal."""
 
 HEAVY = 3.0
-"""Standard deviations by which the mean fourth power of the residuals exceeds that of normal ones where they are none."""
+"""Standard deviations by which the mean fourth power of residuals exceeds that of normal ones where they are none."""
 
 CORE, WITHIN_CORE = 2.0, 0.774
 """Multiple of the noise within which it is estimated, and the mean square there of normal numbers of variance 1."""
@@ -82,8 +82,8 @@ class AbstractStage(eqx.Module):
 
 
 class Plain(AbstractStage):
-    """All points, in `steps` of least squares from the vertical. Believed if they pass the global test and every |w| its
-    limit."""
+    """All points, in `steps` of least squares from the vertical. Believed if they pass the global test, and every |w|
+    its limit."""
 
     steps: int = 8
 
@@ -257,8 +257,8 @@ def _believed_if_it_fits(
 ) -> Decision:
     """The decision for a pose of a quick search, which may have missed a better one.
 
-    Points that agree with a wrong pose, as those of one depth do, lie about it as far as the limit reaches, and fail the
-    global test. Others agree by chance with a probability of about limit / mean |r|.
+    Points that agree with a wrong pose, as those of one depth do, lie about it as far as the limit reaches, and fail
+    the global test. Others agree by chance with a probability of about limit / mean |r|.
     """
     n, k = count(pair.mask), count(use)
     s = squares(pair, pose)

@@ -4,8 +4,8 @@ Random subsets of five points are solved; each of their orientations is scored b
 
     Σ min((r / sigma)², limit²)
 
-(MSAC, Torr and Zisserman 2000), first on some JUDGES of the points, the best on all. The best of each block of subsets is
-improved on the points near it (Chum, Matas and Kittler 2003) and takes the place of the best so far if it costs less.
+(MSAC, Torr and Zisserman 2000), first on some of the points, the `judges`, the best on all. The best of each block of
+subsets is improved on the points near it (Chum, Matas and Kittler 2003) and replaces the best so far if it costs less.
 The search ends when a better orientation, of a larger share p of the points, would have been met with the probability
 `confidence`: after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
 
@@ -34,7 +34,7 @@ from .hypotheses import moved_up, squares, subsets
 from .robust import stepped
 
 LUCK = 2.0
-"""Subsets of right points alone for one whose orientation is near enough: the others are too weak, or lose their root."""
+"""Subsets of right points alone for one that leads to the right orientation: others are too weak, or lose their root."""
 
 PER_SUBSET = 2
 """Orientations that are scored, at most, for each subset on the average of a block."""

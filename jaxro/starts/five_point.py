@@ -185,7 +185,9 @@ def _risen(roots: Float[Array, "2 n problem"], polynomial):
     return jnp.where(found, x, better), found
 
 
-def essential_coefficients(b: Float[Array, "3 3 5 problem"], z: Float[Array, "10 problem"], w: Float[Array, "10 problem"]):
+def essential_coefficients(
+    b: Float[Array, "3 3 5 problem"], z: Float[Array, "10 problem"], w: Float[Array, "10 problem"]
+):
     """(x, y, z, w) of every root: the null vector of B, the longest cross product of two of its rows."""
 
     def value(c):
