@@ -34,7 +34,7 @@ from .hypotheses import moved_up, squares, subsets
 from .robust import stepped
 
 LUCK = 2.0
-"""Subsets of right points alone for one that leads to the right orientation: others are too weak, or lose their root."""
+"""Subsets of right points alone for one that leads to the right orientation: others are weak, or lose their root."""
 
 PER_SUBSET = 2
 """Orientations that are scored, at most, for each subset on the average of a block."""
