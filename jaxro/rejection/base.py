@@ -1,6 +1,7 @@
 """What every rejection procedure returns, and the round they share."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -86,14 +87,20 @@ class Rejection(eqx.Module):
     def only_if(self, fine: Bool[Array, ""], otherwise: OUTCOMES) -> "Rejection":
         """The same decision, with another outcome where it is not fine and there was something to test."""
         outcome = OUTCOMES.where(fine | (self.outcome == OUTCOMES.nothing_to_test), self.outcome, otherwise)
-        return Rejection(
-            mask=self.mask,
-            order=self.order,
-            statistic=self.statistic,
-            log=self.log,
-            orientation=self.orientation,
-            outcome=outcome,
-            undecided=self.undecided,
+        return dataclasses.replace(self, outcome=outcome)
+
+    def taking_back(self, named: Bool[Array, "point"]) -> "Rejection":
+        """The same decision, if it is finished, with the outcome `undecided` between the points named, none of which is
+        rejected. The orientation stays the one without those that were."""
+        finished = self.outcome == OUTCOMES.finished
+        named = named & finished
+        any_named = count(named) > 0
+        return dataclasses.replace(
+            self,
+            mask=self.mask | named,
+            order=jnp.where(named, 0, self.order),
+            outcome=OUTCOMES.where(any_named, OUTCOMES.undecided, self.outcome),
+            undecided=self.undecided | named,
         )
 
 

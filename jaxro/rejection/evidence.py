@@ -5,6 +5,7 @@ number of points that agree proves nothing by itself, therefore, unless the sear
 better orientation, and unless the chance of agreement is measured on the scene itself.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import gammaln
@@ -59,6 +60,13 @@ def accidents(chance: Float[Array, ""], of: Float[Array, ""], kept: Float[Array,
     choices = gammaln(of + 1) - gammaln(of - k + 1) - gammaln(6.0) - gammaln(k - 4)
     value = choices + (k - 5) * jnp.log(chance) + jnp.log(jnp.maximum(of - 5, 1.0))
     return jnp.where(kept > 5, value, jnp.inf)
+
+
+def fewest(chance: Float[Array, ""], of: Float[Array, ""], most: float, size: int) -> Float[Array, ""]:
+    """The fewest points that are no accident: whose expected number of sets as good is at most exp(`most`)."""
+    kept = jnp.arange(6, size + 6, dtype=of.dtype)
+    fine = (jax.vmap(lambda k: accidents(chance, of, k))(kept) <= most) & (kept <= of)
+    return jnp.where(jnp.any(fine), kept[jnp.argmax(fine)], of)
 
 
 def repeats(pair: Pair) -> tuple[Use, Float[Array, "point"]]:

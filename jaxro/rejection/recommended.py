@@ -39,6 +39,7 @@ from .noise import noise_of
 from .ransac import Ransac
 from .robust import agreeing, improved, judged, normalised, one_by_one, scaled, seen, stepped
 from .search import Search, score
+from .undecided import undecided
 
 Use = Bool[Array, "point"]
 
@@ -54,11 +55,18 @@ DEVIATIONS = 3.0
 UNKNOWN = 3000.0
 """Where the standard deviation is not known the search begins with a focal length divided by this."""
 
-FADING = 2.5
+FADING = 3.0
 """Multiple of the noise at which the weight of a point has faded to a quarter, where the noise is not normal."""
+
+OVERWHELMING = math.log(1e-9)
+"""Logarithm of an expected number of accidents at which a search that came to its end is believed in any case."""
 
 HEAVY = 3.0
 """Standard deviations by which the mean fourth power of residuals exceeds that of normal ones where they are none."""
+
+LIMIT, EXPECTED, MANY = 3.3, 1.0, 20.0
+"""Multiple of sigma, number of points expected within it by accident from which weights fade, and the fewest points to
+estimate a noise from."""
 
 CORE, WITHIN_CORE = 2.0, 0.774
 """Multiple of the noise within which it is estimated, and the mean square there of normal numbers of variance 1."""
@@ -102,7 +110,7 @@ class Quick(AbstractStage):
     accidents: float = 1e-4
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
-        found = self.search.run(pair, self.search.begin(pair, self.graduated.search(pair)), 1)
+        found = self.search.run(pair, self.search.begin(pair, self.graduated.search(pair)))
         return _believed_if_it_fits(pair, *settled(pair, found.pose, limit), limit, self.share, self.accidents)
 
 
@@ -143,7 +151,11 @@ class Thorough(AbstractStage):
         best, other = self.graduated.search(once), _from_vertical(once, 8)
         better = score(once, other, self.search.limit) < score(once, best, self.search.limit)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), other, best)
-        found = self.search.run(once, self.search.begin(once, best))
+        agreed, asked = evidence.shifted_agreement(once, best, limit)
+        bound, of = math.log(self.accidents), count(once.mask)
+        fewest = evidence.fewest((agreed + 1) / (asked + 2), of, bound, once.mask.shape[0])
+        worth = self.search.enough_for(fewest, of)
+        found = self.search.run(once, self.search.begin(once, best), worth)
         noise = noise_of(squares(once, found.pose), once.mask)
         scale = jnp.where(noise.known, noise.sigma, 1.0)
         if not self.known:
@@ -152,13 +164,17 @@ class Thorough(AbstractStage):
         pose, use = settled(once, found.pose, limit)
         agreed, asked = evidence.shifted_agreement(once, pose, limit)
         chance = jnp.maximum((agreed + 1) / (asked + 2), found.agreed / jnp.maximum(found.asked, 1.0))
-        certain = evidence.accidents(chance, count(once.mask), count(use)) <= math.log(self.accidents)
-        thorough = found.counted >= self.search.enough(once, pose)
+        expected = evidence.accidents(chance, of, count(use))
+        thorough = (found.counted >= self.search.enough_for(count(use), of)) | (expected <= OVERWHELMING)
+        certain = expected <= bound
         return Decision(pose, evidence.with_repeats(use, again, key), certain & thorough, scale)
 
 
 class Recommended(AbstractProcedure):
     """The stages in turn, each where the one before was not believed; `no_consensus` where the last is not.
+
+    Where another point could be the wrong one as well, the outcome is `undecided`: all these points are named and none
+    of them rejected; the orientation is that without the one that is most likely wrong.
 
     `sigma`: the standard deviation of a coordinate; if None that of the pair. `level`: the probability that a pair
     without errors loses a point.
@@ -180,8 +196,8 @@ class Recommended(AbstractProcedure):
             decision = _where_open(stage, fixed, limit, decision)
         pose, use, believed, _ = decision
         w = normalised(linearised(fixed, pose), use)
-        weighted = _faded(pair, pose, use)
-        return judged(weighted, pose, use, limit, w).only_if(believed, OUTCOMES.no_consensus)
+        rejection = judged(_faded(pair, pose, use), pose, use, limit, w).only_if(believed, OUTCOMES.no_consensus)
+        return rejection.taking_back(_in_doubt(fixed, pose, use))
 
     def separate(self, points: int) -> list["Recommended"]:
         """The stages for pairs of up to so many points as procedures of their own, for batches: each for the pairs that
@@ -202,6 +218,13 @@ def settled(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> tuple[Re
     return pose, use & seen(pair, pose, limit)
 
 
+def _in_doubt(pair: Pair, pose: RelativePose, use: Use) -> Use:
+    """The points of which some are wrong, though nothing tells which; of pairs with few points out."""
+    out = pair.mask & ~use & seen(pair, pose, 0.0)
+    few = count(pair.mask & ~use) <= FEW
+    return undecided(pair, pose, use, out & few)
+
+
 def _from_vertical(pair: Pair, steps: int) -> RelativePose:
     """All points by least squares."""
     start = vertical(jnp.zeros_like(pair.focal_left))
@@ -216,15 +239,20 @@ def _rescaled(pair: Pair, scale: Float[Array, ""]) -> Pair:
 
 def _faded(pair: Pair, pose: RelativePose, use: Use) -> Pair:
     """The pair with weights that fade with the distance from a robust pose where the noise of the points in use is not
-    normal: where the mean fourth power of their residuals tells it by more than chance. (Geman and McClure's weights.)
+    normal, or wrong points among them are to be expected: where the mean fourth power of their residuals tells it by
+    more than chance, or the points out are so many and so near that some of them agree by accident. (Geman and McClure's
+    weights.)
 
     Elsewhere the pair as it is: least squares are then best, and every point that is kept counts fully.
     """
     fixed = lax.stop_gradient(pair)
     k = jnp.maximum(count(use), 1.0)
-    s = jnp.where(use, squares(fixed, pose), 0.0)
+    every = squares(fixed, pose)
+    s = jnp.where(use, every, 0.0)
+    out = fixed.mask & ~use
+    near = total(jnp.where(out, LIMIT / jnp.maximum(jnp.sqrt(every), LIMIT), 0.0))
     mean, fourth = total(s) / k, total(s * s) / k
-    heavy = fourth > mean**2 * (3 + HEAVY * jnp.sqrt(24 / k))
+    heavy = (fourth > mean**2 * (3 + HEAVY * jnp.sqrt(24 / k))) | ((near > EXPECTED) & (k >= MANY))
     core = lax.fori_loop(0, ROUNDS, lambda _, square: _core(s, use, square), mean)
     fade = lambda s: jnp.where(use, 1 / (1 + s / (FADING**2 * core)) ** 2, 0.0)
 

@@ -39,7 +39,7 @@ LUCK = 2.0
 PER_SUBSET = 2
 """Orientations that are scored, at most, for each subset on the average of a block."""
 
-GUIDED = 64
+GUIDED = 24
 """Blocks of which every second one is drawn from the points whose neighbours agree."""
 
 FRONTS = 5
@@ -77,7 +77,7 @@ class Search(eqx.Module):
     points score them first, and the `finalists` best are scored by all points. `steps` of Gauss-Newton improve the best
     of a block, the first on points within `margin` times the limit."""
 
-    count: int = 1 << 18
+    count: int = 1 << 17
     block: int = 256
     confidence: float = 0.99
     limit: float = 3.3
@@ -100,21 +100,23 @@ class Search(eqx.Module):
             asked=zero,
         )
 
-    def run(self, pair: Pair, found: Found, most: int | None = None) -> Found:
-        """The search, continued until it is enough, or `most` blocks have been searched."""
-        most = -(-self.count // self.block) if most is None else most
+    def run(self, pair: Pair, found: Found, worth: Float[Array, ""] | float = math.inf) -> Found:
+        """The search, continued until it is enough, or more subsets than it is `worth` have been searched."""
+        most = -(-self.count // self.block)
         rows = moved_up(pair)
         order = neighbourly(rows, count(pair.mask)) if most > 1 and len(rows) >= NEIGHBOURLY else None
 
         def more(found: Found) -> Bool[Array, ""]:
-            return (found.blocks < most) & (found.counted < found.enough)
+            return (found.blocks < most) & (found.counted < jnp.minimum(found.enough, worth))
 
         return while_loop(more, lambda found: self._searched(pair, rows, order, found), found, pair.focal_left)
 
     def enough(self, pair: Pair, pose: RelativePose) -> Float[Array, ""]:
         """How many subsets are enough, if the share of points that agree with this pose is that of the right ones."""
-        agree = count(pair.mask & (squares(pair, pose) <= self.limit**2))
-        of = count(pair.mask)
+        return self.enough_for(count(pair.mask & (squares(pair, pose) <= self.limit**2)), count(pair.mask))
+
+    def enough_for(self, agree: Float[Array, ""], of: Float[Array, ""]) -> Float[Array, ""]:
+        """How many subsets are enough to meet the orientation of so many right points."""
         share = math.prod(jnp.maximum(agree - k, 0.0) / jnp.maximum(of - k, 1.0) for k in range(5))
         share = jnp.clip(share / LUCK, 1e-12, 1 - 1e-12)
         return jnp.where(of >= 6, math.log1p(-self.confidence) / jnp.log1p(-share), 0.0)
