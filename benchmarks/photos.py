@@ -25,8 +25,6 @@ BELIEVED = 15
 """Inliers from which the answer of a peer is believed."""
 LEVEL = 0.0025
 """Familywise level of `Recommended`: false alarms of a pair without wrong points."""
-OWN_REGION = 11.0705
-"""Quantile .95 of chi-square with five degrees of freedom."""
 
 
 class Found(NamedTuple):
