@@ -151,7 +151,7 @@ def own_programs() -> dict[str, Program]:
 
 
 def peer_programs() -> dict[str, Program]:
-    """The peers. PoseLib's own limit is 1 px; the hard pairs get more iterations."""
+    """The peers, at limits of 1 and 2 px; PoseLib also with fewer iterations at least."""
     return {
         "PoseLib": poselib(max_epipolar_error=1.0),
         "PoseLib, 2 px": poselib(max_epipolar_error=2.0),
