@@ -18,10 +18,10 @@ def machine() -> str:
 
 
 def main() -> int:
-    from . import colmap, engine, reading, rejection, scale
+    from . import colmap, engine, photos, reading, rejection, scale
     from .common import QUICK, Size
 
-    suites = engine.SUITES | rejection.SUITES | reading.SUITES | scale.SUITES | colmap.SUITES
+    suites = engine.SUITES | rejection.SUITES | reading.SUITES | scale.SUITES | colmap.SUITES | photos.SUITES
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few pairs, few repeats: does it run, roughly how fast")

@@ -381,7 +381,7 @@ def _targets(rng: np.random.Generator, kind: str) -> tuple:
 
 # ------------------------------------------------------------------------------------------------------ any position
 
-PLAIN_FOCAL, PLAIN_SIGMA, PLAIN_HALF = 2000.0, 1.0, 2000.0
+PLAIN_FOCAL, PLAIN_SIGMA, PLAIN_HALF = 2000.0, 0.5, 2000.0
 
 
 def any_position(pairs: int, points: int, wrong: float, *, seed: int = 0) -> Scenes:
