@@ -240,8 +240,8 @@ def _rescaled(pair: Pair, scale: Float[Array, ""]) -> Pair:
 def _faded(pair: Pair, pose: RelativePose, use: Use) -> Pair:
     """The pair with weights that fade with the distance from a robust pose where the noise of the points in use is not
     normal, or wrong points among them are to be expected: where the mean fourth power of their residuals tells it by
-    more than chance, or the points out are so many and so near that some of them agree by accident. (Geman and McClure's
-    weights.)
+    more than chance, or the points out are so many and so near that some of them agree by accident. The weights are
+    those of Geman and McClure.
 
     Elsewhere the pair as it is: least squares are then best, and every point that is kept counts fully.
     """

@@ -158,10 +158,10 @@ class Search(eqx.Module):
         if order is None:
             places = subsets(uniform, of)
         else:
-            front = jnp.maximum(of * 0.5 ** (1 + (block // 2) % FRONTS).astype(of.dtype), SMALLEST_FRONT)
+            front = jnp.maximum(of * 0.5 ** (1 + (block // 2) % FRONTS).astype(of.dtype), float(SMALLEST_FRONT))
             guided = self._guided(block)
             places = subsets(uniform, jnp.where(guided, jnp.minimum(jnp.ceil(front), of), of))
-            places = jnp.where(guided, order.at[places].get(mode="clip"), places)
+            places = jnp.where(guided, order.at[places].get(mode="clip").astype(places.dtype), places)
         few = rows.at[places].get(mode="clip")
         x1, y1, x2, y2 = (few[..., k] for k in range(4))
         minus = -jnp.ones_like(x1)
@@ -197,25 +197,30 @@ def _gathered(solutions: five_points.Solutions, most: int) -> tuple[RelativePose
     rotation = flat(jnp.moveaxis(solutions.rotation, 0, 2))
     base = flat(jnp.moveaxis(solutions.base, 0, 1))
     rotation, base = rotation[:, :, source], base[:, source]
-    pose = RelativePose(*rot.to_quaternion(rot.as_matrix(rotation)), base[0], base[1], base[2])
+    pose = jax.vmap(_pose, (2, 1))(rotation, base)
     there = jnp.arange(most) < jnp.sum(exist.astype(int))
     fine = there & jnp.isfinite(sum(jax.tree.leaves(pose)))
     one = jnp.ones_like(pose.qw)
-    return jax.tree.map(lambda a: jnp.where(fine, a, one), pose).normalised(), fine
+    pose = jax.tree.map(lambda a: jnp.where(fine, a, one), pose)
+    return jax.vmap(lambda pose: pose.normalised())(pose), fine
+
+
+def _pose(rotation: Float[Array, "3 3"], base: Float[Array, "3"]) -> RelativePose:
+    return RelativePose(*rot.to_quaternion(rot.as_matrix(rotation)), base[0], base[1], base[2])
 
 
 def _judged(pair: Pair, rows, of, poses: RelativePose, judges: int, limit: float) -> Judgement:
     """What points evenly taken of all say of every orientation, in single precision."""
     size = min(judges, rows.shape[0])
     number = jnp.arange(size)
-    place = jnp.where(of > size, jnp.floor(number * (of / size)).astype(int), number)
-    there = (number < of).astype(jnp.float32)[:, None]
+    place = jnp.where(of > size, jnp.floor(number.astype(of.dtype) * (of / size)).astype(int), number)
+    there = (number.astype(of.dtype) < of).astype(jnp.float32)[:, None]
     single = lambda a: a.astype(jnp.float32)
     points = single(rows.at[place].get(mode="clip"))
     sigma = moved_up_sigma(pair).at[place].get(mode="clip")
     bound = single((limit * sigma) ** 2)[:, None]
-    rotation, base = jax.tree.map(single, poses.relative())
-    f = coplanarity.fundamental_matrix(rotation, base, single(pair.focal_left), single(pair.focal_right))
+    fundamental = lambda pose: coplanarity.fundamental_matrix(*pose.relative(), pair.focal_left, pair.focal_right)
+    f = jax.tree.map(single, jax.vmap(fundamental)(poses))
 
     def one(f, point, use):
         g, square, _ = coplanarity.linearised(f, point, use)
@@ -234,7 +239,7 @@ def neighbourly(rows: Float[Array, "point 4"], of: Float[Array, ""]) -> Int[Arra
     """The places of the points, first those whose neighbours in the left photo are neighbours in the right one, too."""
     size = rows.shape[0]
     single = rows.astype(jnp.float32)
-    there = (jnp.arange(size) < of).astype(jnp.float32)
+    there = (jnp.arange(size, dtype=of.dtype) < of).astype(jnp.float32)
     step = -(-size // NEIGHBOURS)
     others, taken = single[::step], there[::step]
 

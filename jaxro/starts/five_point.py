@@ -186,7 +186,7 @@ def _risen(roots: Float[Array, "2 n problem"], polynomial):
 
 
 def essential_coefficients(
-    b: Float[Array, "3 3 5 problem"], z: Float[Array, "10 problem"], w: Float[Array, "10 problem"]
+    b: Float[Array, "3 3 5 problem"], z: Float[Array, "root problem"], w: Float[Array, "root problem"]
 ):
     """(x, y, z, w) of every root: the null vector of B, the longest cross product of two of its rows."""
 
@@ -208,11 +208,11 @@ def essential_coefficients(
     return _unit(a)
 
 
-def _unit(a: Float[Array, "4 10 problem"]) -> Float[Array, "4 10 problem"]:
+def _unit(a: Float[Array, "4 root problem"]) -> Float[Array, "4 root problem"]:
     return a * lax.rsqrt(jnp.maximum(jnp.sum(a * a, axis=0), TINY))[None]
 
 
-def _polished(basis: Float[Array, "4 3 3 problem"], a: Float[Array, "4 10 problem"], steps: int):
+def _polished(basis: Float[Array, "4 3 3 problem"], a: Float[Array, "4 root problem"], steps: int):
     """Gauss-Newton on F = (E Eᵀ - tr(E Eᵀ)/2 I) E = 0 over the four coefficients, |a| = 1."""
     basis = basis[:, :, :, None]
     identity = jnp.eye(3, dtype=a.dtype)[:, :, None, None]
