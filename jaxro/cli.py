@@ -163,8 +163,7 @@ def colmap(
 @app.command()
 def compare(
     file: Annotated[
-        Path | None,
-        given.file("Its first pair is the layout; without it 16 points in eight rows, and 8 points."),
+        Path | None, given.file("Its first pair is the layout; without it 16 points in eight rows, and 8 points.")
     ] = None,
     procedure: Annotated[
         list[str] | None,
