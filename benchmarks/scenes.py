@@ -4,7 +4,7 @@ Conventions are those of the package: a point is λ p1 seen from the left and B 
 p = (x, y, -f) and y points up; the base has length 1.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,8 @@ class Scenes(NamedTuple):
 
     def __getitem__(self, rows) -> "Scenes":  # pyright: ignore[reportIncompatibleMethodOverride]
         """Some of the pairs."""
-        return Scenes(*(field[rows] for field in tuple(self)))
+        chosen: list[Any] = [field[rows] for field in tuple(self)]
+        return Scenes(*chosen)
 
 
 def joined(parts: list[Scenes]) -> Scenes:

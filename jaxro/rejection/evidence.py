@@ -72,7 +72,9 @@ def fewest(chance: Float[Array, ""], of: Float[Array, ""], most: float, size: in
 def repeats(pair: Pair) -> tuple[Use, Float[Array, "point"]]:
     """The points that repeat an earlier one, which is no evidence of its own, and a number that tells them apart."""
     # what repeats another point is like it in any number made of its coordinates
-    key = sum(c * (k + 0.1) ** 0.5 for k, c in enumerate(pair.coordinates))
+    key = jnp.zeros_like(pair.sigma)
+    for k, c in enumerate(pair.coordinates):
+        key = key + c * (k + 0.1) ** 0.5
     order = jnp.argsort(jnp.where(pair.mask, key, jnp.inf), stable=True)
     sorted_key = key[order]
     again = jnp.concatenate([jnp.zeros(1, bool), sorted_key[1:] == sorted_key[:-1]])
