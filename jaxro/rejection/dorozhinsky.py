@@ -83,7 +83,9 @@ class Dorozhinsky(AbstractProcedure):
             # the mean decides whether, the size which: a point's statistic is its size, or zero while the mean is good
             statistic = jnp.where(wrong, jnp.abs(q), 0.0)
             new = Round(statistic, jnp.asarray(self.eps3), out, q, values(elements))
-            return recorded(history, new), elements, wrong & few, ~wrong | few
+            # what no elements can be determined from is no case for the operator
+            solvable = count(history.mask) >= 5
+            return recorded(history, new), elements, wrong & few & solvable, ~wrong | few
 
         no = jnp.zeros_like(pair.focal_left, bool)
         state = while_loop(lambda state: ~state[3], cycle, (history, zero, no, no), pair.focal_left)
