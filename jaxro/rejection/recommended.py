@@ -124,7 +124,8 @@ class Thorough(AbstractStage):
 
     Believed if the subsets were enough for the share of points kept, and sets as good are not expected by accident more
     than `accidents` times, by the chance of agreement that partners shifted among the points and the orientations that
-    lost have on this scene. Points that repeat others count once. Where sigma is not `known` it is only where the
+    lost have on this scene. Points that repeat others count once. At `least` so many subsets are tried, so
+    that the pose is as good as it can be where no set would be believed. Where sigma is not `known` it is only where the
     search begins: the noise found takes its place.
     """
 
@@ -132,6 +133,7 @@ class Thorough(AbstractStage):
     search: Search = Search()
     accidents: float = 1e-3
     known: bool = True
+    least: int = 2048
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         again, key = evidence.repeats(pair)
@@ -142,7 +144,7 @@ class Thorough(AbstractStage):
         agreed, asked = evidence.shifted_agreement(once, best, limit)
         bound, of = math.log(self.accidents), count(once.mask)
         fewest = evidence.fewest((agreed + 1) / (asked + 2), of, bound, once.mask.shape[0])
-        worth = self.search.enough_for(fewest, of)
+        worth = jnp.maximum(self.search.enough_for(fewest, of), float(self.least))
         found = self.search.run(once, self.search.begin(once, best), worth)
         noise = noise_of(squares(once, found.pose), once.mask)
         scale = jnp.where(noise.known, noise.sigma, 1.0)
