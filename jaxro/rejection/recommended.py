@@ -124,9 +124,9 @@ class Thorough(AbstractStage):
 
     Believed if the subsets were enough for the share of points kept, and sets as good are not expected by accident more
     than `accidents` times, by the chance of agreement that partners shifted among the points and the orientations that
-    lost have on this scene. Points that repeat others count once. At `least` so many subsets are tried, so
-    that the pose is as good as it can be where no set would be believed. Where sigma is not `known` it is only where the
-    search begins: the noise found takes its place.
+    lost have on this scene. Points that repeat others count once. At `least` so many subsets are tried, so that the
+    pose is as good as it can be where no set would be believed. Where sigma is not `known` it is only where the search
+    begins: the noise found takes its place.
     """
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
