@@ -36,7 +36,6 @@ from .base import OUTCOMES, AbstractProcedure, Rejection
 from .fading import faded
 from .graduated_non_convexity import GraduatedNonConvexity
 from .hypotheses import Newton, squares
-from .noise import noise_of
 from .ransac import Ransac
 from .robust import agreeing, improved, judged, normalised, one_by_one, scaled, seen
 from .search import Search, score
@@ -53,20 +52,16 @@ FEW = 7
 DEVIATIONS = 3.0
 """The level of the global test, as multiple of a standard deviation of a normal number."""
 
-UNKNOWN = 3000.0
-"""Where the standard deviation is not known the search begins with a focal length divided by this."""
-
 OVERWHELMING = math.log(1e-9)
 """Logarithm of an expected number of accidents at which a search that came to its end is believed in any case."""
 
 
 class Decision(NamedTuple):
-    """The pose, the points that agree with it, whether that is believed, and the noise in units of the given sigma."""
+    """The pose, the points that agree with it, and whether that is believed."""
 
     pose: RelativePose
     use: Use
     believed: Bool[Array, ""]
-    scale: Float[Array, ""]
 
 
 class AbstractStage(eqx.Module):
@@ -85,7 +80,7 @@ class Plain(AbstractStage):
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         pose = _from_vertical(pair, self.steps)
-        return Decision(pose, pair.mask, _untouched(pair, pose, limit), jnp.ones_like(limit))
+        return Decision(pose, pair.mask, _untouched(pair, pose, limit))
 
 
 class Quick(AbstractStage):
@@ -125,14 +120,12 @@ class Thorough(AbstractStage):
     Believed if the subsets were enough for the share of points kept, and sets as good are not expected by accident more
     than `accidents` times, by the chance of agreement that partners shifted among the points and the orientations that
     lost have on this scene. Points that repeat others count once. At `least` so many subsets are tried, so that the
-    pose is as good as it can be where no set would be believed. Where sigma is not `known` it is only where the search
-    begins: the noise found takes its place.
+    pose is as good as it can be where no set would be believed.
     """
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
     search: Search = Search()
     accidents: float = 1e-3
-    known: bool = True
     least: int = 2048
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
@@ -146,18 +139,13 @@ class Thorough(AbstractStage):
         fewest = evidence.fewest((agreed + 1) / (asked + 2), of, bound, once.mask.shape[0])
         worth = jnp.maximum(self.search.enough_for(fewest, of), float(self.least))
         found = self.search.run(once, self.search.begin(once, best), worth)
-        noise = noise_of(squares(once, found.pose), once.mask)
-        scale = jnp.where(noise.known, noise.sigma, 1.0)
-        if not self.known:
-            once = _rescaled(once, scale)
-            pair = _rescaled(pair, scale)
         pose, use = settled(once, found.pose, limit)
         agreed, asked = evidence.shifted_agreement(once, pose, limit)
         chance = jnp.maximum((agreed + 1) / (asked + 2), found.agreed / jnp.maximum(found.asked, 1.0))
         expected = evidence.accidents(chance, of, count(use))
         thorough = (found.counted >= self.search.enough_for(count(use), of)) | (expected <= OVERWHELMING)
         certain = expected <= bound
-        return Decision(pose, evidence.with_repeats(use, again, key), certain & thorough, scale)
+        return Decision(pose, evidence.with_repeats(use, again, key), certain & thorough)
 
 
 class Recommended(AbstractProcedure):
@@ -181,10 +169,10 @@ class Recommended(AbstractProcedure):
             lambda n: critical_values.normal(self.level / jnp.maximum(n, 1.0)), pair.x_left.shape[0], count(pair.mask)
         )
         zero = jnp.zeros_like(limit)
-        decision = Decision(vertical(zero), fixed.mask & False, zero > 0, zero + 1)
+        decision = Decision(vertical(zero), fixed.mask & False, zero > 0)
         for stage in self.stages:
             decision = _where_open(stage, fixed, limit, decision)
-        pose, use, believed, _ = decision
+        pose, use, believed = decision
         w = normalised(linearised(fixed, pose), use)
         rejection = judged(faded(pair, pose, use), pose, use, limit, w).only_if(believed, OUTCOMES.no_consensus)
         return rejection.taking_back(_in_doubt(fixed, pose, use))
@@ -221,12 +209,6 @@ def _from_vertical(pair: Pair, steps: int) -> RelativePose:
     return lax.fori_loop(0, steps, lambda _, pose: improved(pair, pose, pair.mask), start)
 
 
-def _rescaled(pair: Pair, scale: Float[Array, ""]) -> Pair:
-    """The pair with so many times the standard deviations."""
-    sigma = jnp.where(pair.mask, pair.sigma * scale, 1.0)
-    return Pair(*pair.coordinates, sigma, pair.mask, pair.focal_left, pair.focal_right)
-
-
 def _untouched(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether all points agree: the global test, every |w|, and every point in front of both photos."""
     linear = linearised(pair, pose)
@@ -253,7 +235,7 @@ def _believed_if_it_fits(
     chance = limit / jnp.maximum(mean, 2 * limit)
     certain = evidence.accidents(chance, n, k) <= math.log(accidents)
     untouched = (count(out) == 0) & _untouched(pair, pose, limit)
-    return Decision(pose, use, (fits & certain) | untouched, jnp.ones_like(limit))
+    return Decision(pose, use, (fits & certain) | untouched)
 
 
 def _where_open(stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision) -> Decision:

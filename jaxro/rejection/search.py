@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import coplanarity, rotations as rot
 from ..conditions import linearised
-from ..elements import RelativePose, vertical
+from ..elements import RelativePose
 from ..pairs import Pair
 from ..programs import while_loop
 from ..reductions import count, total
@@ -271,8 +271,3 @@ def score(pair: Pair, pose: RelativePose, limit: float) -> Float[Array, ""]:
     """Σ min((r / sigma)², limit²), infinite where it is no number."""
     value = total(jnp.minimum(squares(pair, pose), limit**2))
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
-
-
-def nothing(pair: Pair) -> RelativePose:
-    """The pose to begin with where nothing is known."""
-    return vertical(jnp.zeros_like(pair.focal_left))
