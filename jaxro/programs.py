@@ -262,6 +262,20 @@ def while_loop(more: Callable, turn: Callable, state: PyTree, like: Array) -> Py
     return jax.lax.while_loop(more, turn, jax.tree.map(lambda a: jax.lax.select(always, a, a), state))
 
 
+def where_needed(needed: Array, function: Callable[[Array], PyTree], otherwise: PyTree) -> PyTree:
+    """`function`(needed) where it is needed, else `otherwise`: computed under `vmap` only if some pair needs it.
+
+    It is a loop of at most one turn. What `function` works on has to depend on its argument (a mask, say), or the
+    compiler computes it outside of the loop.
+    """
+
+    def turn(state):
+        open_, value = state
+        return open_ & False, jax.tree.map(lambda a, b: jnp.where(open_, a, b), function(open_), value)
+
+    return while_loop(lambda state: state[0], turn, (needed, otherwise), needed)[1]
+
+
 _AS_ONE = {"inlineable": "false", "xla_cpu_small_call": "true"}
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..elements import RelativePose
 from ..pairs import Pair
-from ..reductions import count
+from ..reductions import count, total
 from .hypotheses import moved_up, squares
 
 Values = Float[Array, "point"]
@@ -22,6 +22,9 @@ Use = Bool[Array, "point"]
 SHIFTS, TRIALS = 8, 4096
 """Other partners that each point is given: at least so many, more where there are few points, to make so many trials.
 """
+
+NEAREST = 0.1
+"""Part of the limit below which no point is nearer by more than accident."""
 
 
 def chi_squared_limit(deviations: float, freedom: Float[Array, ""]) -> Float[Array, ""]:
@@ -49,6 +52,13 @@ def shifted_agreement(pair: Pair, pose: RelativePose, limit: ArrayLike) -> tuple
     return lax.fori_loop(0, shifts, shifted, (n * 0, n * 0))
 
 
+def scattered(squares: Values, out: Use, limit: Float[Array, ""]) -> Float[Array, ""]:
+    """The chance of agreement if points agreed as seldom as those that are out are far: limit / mean |r| / sigma, twice
+    that of points spread evenly up to twice their mean, as near ones are the more frequent ones."""
+    mean = total(jnp.where(out, jnp.sqrt(squares), 0.0)) / jnp.maximum(count(out), 1.0)
+    return limit / jnp.maximum(mean, 2 * limit)
+
+
 def accidents(chance: Float[Array, ""], of: Float[Array, ""], kept: Float[Array, ""]) -> Float[Array, ""]:
     """Logarithm of the expected number of sets as good by accident (Moisan and Stival 2004),
 
@@ -62,10 +72,27 @@ def accidents(chance: Float[Array, ""], of: Float[Array, ""], kept: Float[Array,
     return jnp.where(kept > 5, value, jnp.inf)
 
 
+def least_accidents(
+    squares: Values, use: Use, chance: Float[Array, ""], of: Float[Array, ""], limit: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The same of the nearest k of the points in use, for the k of which it is least: `squares` = (r / sigma)².
+
+    Another point is as near as the k-th of them with a probability that is proportional to its distance, and is
+    `chance` within the limit (Moisan and Stival 2004). So right points that lie well within the limit are the stronger
+    evidence for it, and sigma need not be known well.
+    """
+    nearest = jnp.sort(jnp.where(use, squares, jnp.inf))
+    kept = jnp.arange(1, nearest.shape[0] + 1, dtype=nearest.dtype)
+    part = jnp.clip(jnp.sqrt(nearest) / limit, NEAREST, 1.0)
+    each = jax.vmap(lambda part, k: accidents(chance * part, of, k))(part, kept)
+    return jnp.min(jnp.where(nearest <= limit**2, each, jnp.inf))
+
+
 def fewest(chance: Float[Array, ""], of: Float[Array, ""], most: float, size: int) -> Float[Array, ""]:
-    """The fewest points that are no accident: whose expected number of sets as good is at most exp(`most`)."""
+    """The fewest points that are no accident: whose expected number of sets as good is at most exp(`most`), if they lie
+    within half of the limit."""
     kept = jnp.arange(6, size + 6, dtype=of.dtype)
-    fine = (jax.vmap(lambda k: accidents(chance, of, k))(kept) <= most) & (kept <= of)
+    fine = (jax.vmap(lambda k: accidents(chance / 2, of, k))(kept) <= most) & (kept <= of)
     return jnp.where(jnp.any(fine), kept[jnp.argmax(fine)], of)
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 from ..conditions import linearised
 from ..elements import RelativePose
 from ..pairs import Pair
+from ..programs import where_needed
 from ..reductions import count, total
 from .hypotheses import squares
 from .robust import stepped
@@ -26,15 +27,15 @@ estimate a noise from."""
 CORE, WITHIN_CORE = 2.0, 0.774
 """Multiple of the noise within which it is estimated, and the mean square there of normal numbers of variance 1."""
 
-ROUNDS = 10
-"""Steps with fading weights, and of the estimate of the noise."""
+ESTIMATES, STEPS = 6, 6
+"""Turns of the estimate of the noise, and steps with fading weights."""
 
 
 def faded(pair: Pair, pose: RelativePose, use: Use) -> Pair:
     """The pair with weights that fade with the distance from a robust pose where the noise of the points in use is not
     normal, or wrong points among them are to be expected: where the mean fourth power of their residuals tells it by
     more than chance, or the points out are so many and so near that some of them agree by accident. The weights are
-    those of Geman and McClure.
+    those of Geman and McClure, on the scale of the noise that the residuals show, whatever sigma was given.
 
     Elsewhere the pair as it is: least squares are then best, and every point that is kept counts fully.
     """
@@ -46,16 +47,25 @@ def faded(pair: Pair, pose: RelativePose, use: Use) -> Pair:
     near = total(jnp.where(out, LIMIT / jnp.maximum(jnp.sqrt(every), LIMIT), 0.0))
     mean, fourth = total(s) / k, total(s * s) / k
     heavy = (fourth > mean**2 * (3 + HEAVY * jnp.sqrt(24 / k))) | ((near > EXPECTED) & (k >= MANY))
-    core = lax.fori_loop(0, ROUNDS, lambda _, square: _core(s, use, square), mean)
-    fade = lambda s: jnp.where(use, 1 / (1 + s / (FADING**2 * core)) ** 2, 0.0)
+    one = jnp.ones_like(every)
+    factor = where_needed(heavy, lambda needed: _factors(fixed, pose, use & needed), one)
+    return Pair(*pair.coordinates, pair.sigma * factor, pair.mask, pair.focal_left, pair.focal_right)
+
+
+def _factors(pair: Pair, pose: RelativePose, use: Use) -> Float[Array, "point"]:
+    """By how much the standard deviations grow that have the weights of a solution with fading weights."""
+
+    s = squares(pair, pose)
+    mean = total(jnp.where(use, s, 0.0)) / jnp.maximum(count(use), 1.0)
+    noise = lax.fori_loop(0, ESTIMATES, lambda _, square: _core(s, use, square), mean)
+    fade = lambda s: jnp.where(use, 1 / (1 + s / (FADING**2 * noise)) ** 2, 0.0)
 
     def step(_, pose):
-        linear = linearised(fixed, pose)
+        linear = linearised(pair, pose)
         return stepped(pose, linear, linear.weight * fade(linear.squares))
 
-    pose = lax.fori_loop(0, ROUNDS, step, pose)
-    factor = jnp.where(heavy & use, jnp.sqrt(1 / jnp.maximum(fade(squares(fixed, pose)), 1e-6)), 1.0)
-    return Pair(*pair.coordinates, pair.sigma * factor, pair.mask, pair.focal_left, pair.focal_right)
+    pose = lax.fori_loop(0, STEPS, step, pose)
+    return jnp.where(use, jnp.sqrt(1 / jnp.maximum(fade(squares(pair, pose)), 1e-6)), 1.0)
 
 
 def _core(s: Float[Array, "point"], use: Use, square: Float[Array, ""]) -> Float[Array, ""]:

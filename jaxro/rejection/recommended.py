@@ -2,11 +2,10 @@
 
 1. `Plain`: all points, from the vertical. If they pass the global test and no |w| exceeds its limit, nothing is
    searched and nothing rejected.
-2. `Quick`: graduated weights from the vertical, held against a few random subsets of five points in any position.
-   Believed only if the points kept pass the global test with the given standard deviation and are no accident.
-3. `NearVertical`: of few points many subsets, solved from the vertical; believed in the same way.
-4. `Thorough`: the best of these held against random subsets in any position until a better orientation would have been
-   met.
+2. `Quick`: graduated weights from the vertical. Believed only if the points kept pass the global test with the given
+   standard deviation and are no accident.
+3. `Thorough`: the best of what begins at the vertical, held against random subsets in any position until a better
+   orientation would have been met.
 
 Every orientation is compared by the same truncated cost. What is found is solved by least squares, and every point, in
 use or not, judged anew by its normalised residual |w| at the familywise level, in turns: a good point that a search
@@ -29,7 +28,7 @@ from .. import critical_values
 from ..conditions import linearised
 from ..elements import RelativePose, vertical
 from ..pairs import Pair, cleaned
-from ..programs import while_loop
+from ..programs import where_needed
 from ..reductions import count, total
 from . import evidence
 from .base import OUTCOMES, AbstractProcedure, Rejection
@@ -76,7 +75,7 @@ class Plain(AbstractStage):
     """All points, in `steps` of least squares from the vertical. Believed if they pass the global test, and every |w|
     its limit."""
 
-    steps: int = 8
+    steps: int = 5
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         pose = _from_vertical(pair, self.steps)
@@ -84,68 +83,77 @@ class Plain(AbstractStage):
 
 
 class Quick(AbstractStage):
-    """The graduated search, held against a few subsets. Believed if at least `share` of the points are kept, these pass
-    the global test, and sets as good are not expected by accident more than `accidents` times."""
+    """The graduated search. Believed if at least `share` of the points are kept, these pass the global test, and sets
+    as good are not expected by accident more than `accidents` times."""
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
-    search: Search = Search(count=4, block=4, finalists=2)
     share: float = 0.4
     accidents: float = 1e-4
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
-        found = self.search.run(pair, self.search.begin(pair, self.graduated.search(pair)))
-        return _believed_if_it_fits(pair, *settled(pair, found.pose, limit), limit, self.share, self.accidents)
-
-
-class NearVertical(AbstractStage):
-    """Subsets solved by Newton's method from the vertical, for pairs of at most `most` points: of few points this finds
-    what a search in any position takes long for. Believed as `Quick` is."""
-
-    search: Ransac = Ransac(hypotheses=Newton(block=64), count=1024, limit=5.0)
-    most: int = 32
-    share: float = 0.4
-    accidents: float = 0.02
-
-    def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
-        small = count(pair.mask) <= self.most
-        pair = cleaned(pair.with_mask(pair.mask & small))[0]
-        pose, use = settled(pair, self.search.search(pair), limit)
-        decision = _believed_if_it_fits(pair, pose, use, limit, self.share, self.accidents)
-        return decision._replace(believed=decision.believed & small)
+        decision = settled(pair, self.graduated.search(pair), limit)
+        return _believed_if_it_fits(pair, *decision, limit, self.share, self.accidents)
 
 
 class Thorough(AbstractStage):
-    """Random subsets until a better orientation would have been met, and the evidence for what is found.
+    """Random subsets in any position until a better orientation would have been met, and the evidence for what is
+    found.
 
-    Believed if the subsets were enough for the share of points kept, and sets as good are not expected by accident more
-    than `accidents` times, by the chance of agreement that partners shifted among the points and the orientations that
-    lost have on this scene. Points that repeat others count once. At `least` so many subsets are tried, so that the
-    pose is as good as it can be where no set would be believed.
+    It begins with the best of all points from the vertical, the graduated search, and for at most `few` points many
+    subsets solved from the vertical: of few points that finds what a search in any position takes long for. If that
+    fits as `Quick` asks, with `accidents_at_once`, it is believed at once. Otherwise it is believed if the subsets were
+    enough to have met a set of `better` times as many points, and sets as good are not expected by accident more than
+    `accidents` times, by the chance of agreement that partners shifted among the points and the orientations that lost
+    have on this scene. Points that repeat others count once. The search ends when no set that it could still find would
+    be believed, after at least `least` subsets, so that the pose is as good as it can be where nothing is believed.
     """
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
+    near: Ransac = Ransac(hypotheses=Newton(block=64), count=1024, limit=5.0)
+    few: int = 32
     search: Search = Search()
+    share: float = 0.4
+    accidents_at_once: float = 0.02
     accidents: float = 1e-3
-    least: int = 2048
+    better: float = 1.5
+    least: int = 256
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         again, key = evidence.repeats(pair)
         once = cleaned(pair.with_mask(pair.mask & ~again))[0]
-        best, other = self.graduated.search(once), _from_vertical(once, 8)
-        better = score(once, other, self.search.limit) < score(once, best, self.search.limit)
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), other, best)
-        agreed, asked = evidence.shifted_agreement(once, best, limit)
-        bound, of = math.log(self.accidents), count(once.mask)
-        fewest = evidence.fewest((agreed + 1) / (asked + 2), of, bound, once.mask.shape[0])
+        first = self._near_vertical(once)
+        settled_first = settled(once, first, limit)
+        at_once = _believed_if_it_fits(once, *settled_first, limit, self.share, self.accidents_at_once)
+
+        of, bound = count(once.mask), math.log(self.accidents)
+        fewest = evidence.fewest(self._chance(once, *settled_first, limit), of, bound, once.mask.shape[0])
         worth = jnp.maximum(self.search.enough_for(fewest, of), float(self.least))
-        found = self.search.run(once, self.search.begin(once, best), worth)
+        worth = jnp.where(at_once.believed, 0.0, worth)
+        found = self.search.run(once, self.search.begin(once, first), worth)
         pose, use = settled(once, found.pose, limit)
-        agreed, asked = evidence.shifted_agreement(once, pose, limit)
-        chance = jnp.maximum((agreed + 1) / (asked + 2), found.agreed / jnp.maximum(found.asked, 1.0))
-        expected = evidence.accidents(chance, of, count(use))
-        thorough = (found.counted >= self.search.enough_for(count(use), of)) | (expected <= OVERWHELMING)
-        certain = expected <= bound
-        return Decision(pose, evidence.with_repeats(use, again, key), certain & thorough)
+
+        chance = jnp.maximum(self._chance(once, pose, use, limit), found.agreed / jnp.maximum(found.asked, 1.0))
+        expected = evidence.least_accidents(squares(once, pose), use, chance, of, limit)
+        enough = self.search.enough_for(jnp.minimum(self.better * count(use), of), of)
+        thorough = (found.counted >= enough) | (expected <= OVERWHELMING)
+        later = Decision(pose, use, (expected <= bound) & thorough)
+        pose, use, believed = jax.tree.map(lambda a, b: jnp.where(at_once.believed, a, b), at_once, later)
+        return Decision(pose, evidence.with_repeats(use, again, key), believed)
+
+    def _chance(self, pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]) -> Float[Array, ""]:
+        """The chance that a wrong point agrees with a pose."""
+        agreed, asked = evidence.shifted_agreement(pair, pose, limit)
+        spread = evidence.scattered(squares(pair, pose), pair.mask & ~use, limit) / 2
+        return jnp.maximum((agreed + 1) / (asked + 2), spread)
+
+    def _near_vertical(self, pair: Pair) -> RelativePose:
+        """The best orientation of those that begin at the vertical."""
+        small = cleaned(pair.with_mask(pair.mask & (count(pair.mask) <= self.few)))[0]
+        best = _from_vertical(pair, 8)
+        for other in (self.graduated.search(pair), self.near.search(small)):
+            better = score(pair, other, self.search.limit) < score(pair, best, self.search.limit)
+            best = jax.tree.map(lambda a, b, better=better: jnp.where(better, a, b), other, best)
+        return best
 
 
 class Recommended(AbstractProcedure):
@@ -160,7 +168,7 @@ class Recommended(AbstractProcedure):
 
     sigma: float | None = None
     level: float = 0.0025
-    stages: tuple[AbstractStage, ...] = (Plain(), Quick(), NearVertical(), Thorough())
+    stages: tuple[AbstractStage, ...] = (Plain(), Quick(), Thorough())
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
@@ -174,33 +182,40 @@ class Recommended(AbstractProcedure):
             decision = _where_open(stage, fixed, limit, decision)
         pose, use, believed = decision
         w = normalised(linearised(fixed, pose), use)
-        rejection = judged(faded(pair, pose, use), pose, use, limit, w).only_if(believed, OUTCOMES.no_consensus)
-        return rejection.taking_back(_in_doubt(fixed, pose, use))
+        weighted = faded(pair, pose, use & believed)
+        rejection = judged(weighted, pose, use, limit, w).only_if(believed, OUTCOMES.no_consensus)
+        return rejection.taking_back(_in_doubt(fixed, pose, use, believed))
 
     def separate(self, points: int) -> list["Recommended"]:
-        """The stages for pairs of up to so many points as procedures of their own, for batches: each for the pairs that
-        the one before left open."""
-        return [dataclasses.replace(self, stages=(stage,)) for stage in self.stages]
+        """Two procedures for batches: the first stages, which are quick for any number of pairs at once, and the search
+        for the pairs that these left open."""
+        parts = self.stages[:2], self.stages[2:]
+        return [dataclasses.replace(self, stages=stages) for stages in parts if stages]
 
 
 def settled(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> tuple[RelativePose, Use]:
     """The pose and the points that agree with it, from a pose near the right one."""
     use = pair.mask & (squares(pair, pose) <= limit**2)
     found = agreeing(pair, pose, use, limit, ROUNDS)
-    best, lowest, _ = one_by_one(pair, *found, limit, 2)
     # a few small errors do not stand out in a search: the points one by one, beginning with all of them
-    few = count(pair.mask & ~best[1]) <= FEW
+    few = count(pair.mask & ~found[1]) <= FEW
+    best, lowest, _ = one_by_one(pair, *found, limit, 2, few)
     other, cost, rests = one_by_one(pair, pose, pair.mask, limit, ROUNDS, few)
     first = rests & (cost < lowest)
     pose, use = jax.tree.map(lambda a, b: jnp.where(first, a, b), other, best)
     return pose, use & seen(pair, pose, limit)
 
 
-def _in_doubt(pair: Pair, pose: RelativePose, use: Use) -> Use:
+def _in_doubt(pair: Pair, pose: RelativePose, use: Use, believed: Bool[Array, ""]) -> Use:
     """The points of which some are wrong, though nothing tells which; of pairs with few points out."""
-    out = pair.mask & ~use & seen(pair, pose, 0.0)
-    few = count(pair.mask & ~use) <= FEW
-    return undecided(pair, pose, use, out & few)
+    out = pair.mask & ~use
+    asked = believed & (count(out) > 0) & (count(out) <= FEW)
+
+    def found(asked):
+        own = pair.with_mask(pair.mask & asked)
+        return undecided(own, pose, use & asked, out & asked & seen(own, pose, 0.0))
+
+    return where_needed(asked, found, jnp.zeros_like(use))
 
 
 def _from_vertical(pair: Pair, steps: int) -> RelativePose:
@@ -231,21 +246,11 @@ def _believed_if_it_fits(
     misfit = total(jnp.where(use, s, 0.0))
     fits = (misfit <= evidence.chi_squared_limit(DEVIATIONS, k - 5)) & (k >= share * n) & (k > 5)
     out = pair.mask & ~use
-    mean = total(jnp.where(out, jnp.sqrt(s), 0.0)) / jnp.maximum(count(out), 1.0)
-    chance = limit / jnp.maximum(mean, 2 * limit)
-    certain = evidence.accidents(chance, n, k) <= math.log(accidents)
-    untouched = (count(out) == 0) & _untouched(pair, pose, limit)
-    return Decision(pose, use, (fits & certain) | untouched)
+    certain = evidence.accidents(evidence.scattered(s, out, limit), n, k) <= math.log(accidents)
+    return Decision(pose, use, fits & (certain | (count(out) == 0)))
 
 
 def _where_open(stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision) -> Decision:
-    """The decision of a stage where there is none yet: a loop of at most one round, which under vmap is entered only
-    if some pair of the batch needs it. What it works on depends on the round, or XLA would compute it anyway."""
-
-    def decide(state):
-        open_, decision = state
-        masked = cleaned(pair.with_mask(pair.mask & open_))[0]
-        new = stage(masked, limit)
-        return open_ & False, jax.tree.map(lambda a, b: jnp.where(open_, a, b), new, decision)
-
-    return while_loop(lambda state: state[0], decide, (~before.believed, before), pair.focal_left)[1]
+    """The decision of a stage where there is none yet."""
+    decide = lambda open_: stage(cleaned(pair.with_mask(pair.mask & open_))[0], limit)
+    return where_needed(~before.believed, decide, before)

@@ -78,12 +78,12 @@ class Search(eqx.Module):
     of a block, the first on points within `margin` times the limit."""
 
     count: int = 1 << 17
-    block: int = 256
+    block: int = 64
     confidence: float = 0.99
     limit: float = 3.3
     margin: float = math.sqrt(2)
     judges: int = 96
-    finalists: int = 16
+    finalists: int = 4
     steps: int = 3
     seed: int = 0
 
@@ -149,7 +149,7 @@ class Search(eqx.Module):
         )
 
     def _guided(self, block: Int[Array, ""]) -> Bool[Array, ""]:
-        return (block < GUIDED) & (block % 2 == 0)
+        return (block < GUIDED) & (block % 2 == 1)
 
     def _hypotheses(self, pair: Pair, rows, order, block) -> tuple[RelativePose, Bool[Array, "hypothesis"]]:
         """The orientations of a block of subsets."""
