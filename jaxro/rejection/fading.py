@@ -20,7 +20,7 @@ FADING = 3.0
 HEAVY = 3.0
 """Standard deviations by which the mean fourth power of residuals exceeds that of normal ones where they are none."""
 
-LIMIT, EXPECTED, MANY = 3.3, 1.0, 20.0
+LIMIT, EXPECTED, MANY = 3.3, 3.0, 20.0
 """Multiple of sigma, number of points expected within it by accident from which weights fade, and the fewest points to
 estimate a noise from."""
 

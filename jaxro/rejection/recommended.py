@@ -28,16 +28,17 @@ from .. import critical_values
 from ..conditions import linearised
 from ..elements import RelativePose, vertical
 from ..pairs import Pair, cleaned
-from ..programs import where_needed
+from ..programs import where_needed, while_loop
 from ..reductions import count, total
 from . import evidence
 from .base import OUTCOMES, AbstractProcedure, Rejection
 from .fading import faded
 from .graduated_non_convexity import GraduatedNonConvexity
 from .hypotheses import Newton, squares
+from .noise import noise_of
 from .ransac import Ransac
 from .robust import agreeing, improved, judged, normalised, one_by_one, scaled, seen
-from .search import Search, score
+from .search import Found, Search, score
 from .undecided import undecided
 
 Use = Bool[Array, "point"]
@@ -48,6 +49,9 @@ ROUNDS = 10
 FEW = 7
 """Points out up to which they are also judged one by one, beginning with all of them."""
 
+TURNS = 2
+"""Searches, the second one with the noise that the first one found."""
+
 DEVIATIONS = 3.0
 """The level of the global test, as multiple of a standard deviation of a normal number."""
 
@@ -55,12 +59,24 @@ OVERWHELMING = math.log(1e-9)
 """Logarithm of an expected number of accidents at which a search that came to its end is believed in any case."""
 
 
+APART = 0.6
+"""Ratio of the noise found to the noise taken below which a search begins again with what was found."""
+
+LEAST, MOST = 0.05, 20.0
+"""Bounds of the noise found, as multiples of the noise taken at first."""
+
+UNKNOWN = 3000.0
+"""Where nothing is said of the noise, a search begins with this part of the focal length."""
+
+
 class Decision(NamedTuple):
-    """The pose, the points that agree with it, and whether that is believed."""
+    """The pose, the points that agree with it, whether that is believed, and by how many times the standard deviations
+    that the pair states it was decided."""
 
     pose: RelativePose
     use: Use
     believed: Bool[Array, ""]
+    scale: Float[Array, ""]
 
 
 class AbstractStage(eqx.Module):
@@ -79,7 +95,7 @@ class Plain(AbstractStage):
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         pose = _from_vertical(pair, self.steps)
-        return Decision(pose, pair.mask, _untouched(pair, pose, limit))
+        return Decision(pose, pair.mask, _untouched(pair, pose, limit), jnp.ones_like(limit))
 
 
 class Quick(AbstractStage):
@@ -106,6 +122,9 @@ class Thorough(AbstractStage):
     `accidents` times, by the chance of agreement that partners shifted among the points and the orientations that lost
     have on this scene. Points that repeat others count once. The search ends when no set that it could still find would
     be believed, after at least `least` subsets, so that the pose is as good as it can be where nothing is believed.
+
+    Where the residuals show a much smaller noise than was taken, the search begins again with that. Where sigma is not
+    `known`, a larger one as well, and the points are judged by the noise found.
     """
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
@@ -117,34 +136,55 @@ class Thorough(AbstractStage):
     accidents: float = 1e-3
     better: float = 1.5
     least: int = 256
+    known: bool = True
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         again, key = evidence.repeats(pair)
         once = cleaned(pair.with_mask(pair.mask & ~again))[0]
         first = self._near_vertical(once)
-        settled_first = settled(once, first, limit)
-        at_once = _believed_if_it_fits(once, *settled_first, limit, self.share, self.accidents_at_once)
+        at_once = _believed_if_it_fits(once, *settled(once, first, limit), limit, self.share, self.accidents_at_once)
+        at_once = at_once._replace(believed=at_once.believed & self.known)
 
-        of, bound = count(once.mask), math.log(self.accidents)
-        fewest = evidence.fewest(self._chance(once, *settled_first, limit), of, bound, once.mask.shape[0])
-        worth = jnp.maximum(self.search.enough_for(fewest, of), float(self.least))
-        worth = jnp.where(at_once.believed, 0.0, worth)
-        found = self.search.run(once, self.search.begin(once, first), worth)
+        found, scale = self._searched(once, first, ~at_once.believed, limit)
+        scale = jnp.ones_like(scale) if self.known else scale
+        once = _rescaled(once, scale)
         pose, use = settled(once, found.pose, limit)
-
-        chance = jnp.maximum(self._chance(once, pose, use, limit), found.agreed / jnp.maximum(found.asked, 1.0))
+        chance = jnp.maximum(_chance(once, pose, use, limit), found.agreed / jnp.maximum(found.asked, 1.0))
+        of = count(once.mask)
         expected = evidence.least_accidents(squares(once, pose), use, chance, of, limit)
         enough = self.search.enough_for(jnp.minimum(self.better * count(use), of), of)
         thorough = (found.counted >= enough) | (expected <= OVERWHELMING)
-        later = Decision(pose, use, (expected <= bound) & thorough)
-        pose, use, believed = jax.tree.map(lambda a, b: jnp.where(at_once.believed, a, b), at_once, later)
-        return Decision(pose, evidence.with_repeats(use, again, key), believed)
+        later = Decision(pose, use, (expected <= math.log(self.accidents)) & thorough, scale)
+        decision = jax.tree.map(lambda a, b: jnp.where(at_once.believed, a, b), at_once, later)
+        return decision._replace(use=evidence.with_repeats(decision.use, again, key))
 
-    def _chance(self, pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]) -> Float[Array, ""]:
-        """The chance that a wrong point agrees with a pose."""
-        agreed, asked = evidence.shifted_agreement(pair, pose, limit)
-        spread = evidence.scattered(squares(pair, pose), pair.mask & ~use, limit) / 2
-        return jnp.maximum((agreed + 1) / (asked + 2), spread)
+    def _searched(
+        self, pair: Pair, first: RelativePose, wanted: Bool[Array, ""], limit: Float[Array, ""]
+    ) -> tuple[Found, Float[Array, ""]]:
+        """The search from a first pose, where it is wanted, and the noise found by it, as a multiple of that stated."""
+        least = LEAST if self.known else 1 / MOST
+        most = 1.0 if self.known else MOST
+
+        def turn(state):
+            k, _, scale, found = state
+            own = _rescaled(pair, scale)
+            found = self.search.run(own, self.search.begin(own, found.pose), self._worth(own, found.pose, limit))
+            noise = noise_of(squares(pair, found.pose), pair.mask)
+            new = jnp.clip(jnp.where(noise.known, noise.sigma, scale), least, most)
+            apart = (new < APART * scale) | (scale < APART * new)
+            return k + 1, apart, new, found
+
+        one = jnp.ones_like(limit)
+        start = jnp.zeros((), int), wanted, one, self.search.begin(pair, first)
+        _, _, scale, found = while_loop(lambda state: state[1] & (state[0] < TURNS), turn, start, pair.focal_left)
+        return found, scale
+
+    def _worth(self, pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> Float[Array, ""]:
+        """How many subsets are worth it: enough to meet the smallest set that would be believed."""
+        of = count(pair.mask)
+        use = pair.mask & (squares(pair, pose) <= limit**2)
+        fewest = evidence.fewest(_chance(pair, pose, use, limit), of, math.log(self.accidents), pair.mask.shape[0])
+        return jnp.maximum(self.search.enough_for(fewest, of), float(self.least))
 
     def _near_vertical(self, pair: Pair) -> RelativePose:
         """The best orientation of those that begin at the vertical."""
@@ -163,32 +203,48 @@ class Recommended(AbstractProcedure):
     of them rejected; the orientation is that without the one that is most likely wrong.
 
     `sigma`: the standard deviation of a coordinate; if None that of the pair. `level`: the probability that a pair
-    without errors loses a point.
+    without errors loses a point. `known`: whether sigma is known. If not, it is only where the search begins (the focal
+    length / UNKNOWN for a pair whose sigma are all 1, as those that state none), and the points are judged by the noise
+    that is found: sigma0 of the orientation, as a multiple of the sigma of the pair.
     """
 
     sigma: float | None = None
     level: float = 0.0025
     stages: tuple[AbstractStage, ...] = (Plain(), Quick(), Thorough())
+    known: bool = True
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = scaled(cleaned(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
+        begin = jnp.ones_like(pair.focal_left) if self.known else _unit(fixed)
+        fixed = _rescaled(fixed, begin)
         limit = critical_values.by_count(
             lambda n: critical_values.normal(self.level / jnp.maximum(n, 1.0)), pair.x_left.shape[0], count(pair.mask)
         )
         zero = jnp.zeros_like(limit)
-        decision = Decision(vertical(zero), fixed.mask & False, zero > 0)
-        for stage in self.stages:
+        decision = Decision(vertical(zero), fixed.mask & False, zero > 0, zero + 1)
+        for stage in self.deciding:
             decision = _where_open(stage, fixed, limit, decision)
-        pose, use, believed = decision
+        pose, use, believed, scale = decision
+        fixed = _rescaled(fixed, scale)
         w = normalised(linearised(fixed, pose), use)
-        weighted = faded(pair, pose, use & believed)
+        weighted = faded(_rescaled(pair, begin * scale), pose, use & believed)
+        weighted = _rescaled(weighted, 1 / (begin * scale))
         rejection = judged(weighted, pose, use, limit, w).only_if(believed, OUTCOMES.no_consensus)
         return rejection.taking_back(_in_doubt(fixed, pose, use, believed))
+
+    @property
+    def deciding(self) -> tuple[AbstractStage, ...]:
+        """The stages that decide: where sigma is not known only those that find the noise themselves."""
+        if self.known:
+            return self.stages
+        return tuple(dataclasses.replace(stage, known=False) for stage in self.stages if isinstance(stage, Thorough))
 
     def separate(self, points: int) -> list["Recommended"]:
         """Two procedures for batches: the first stages, which are quick for any number of pairs at once, and the search
         for the pairs that these left open."""
+        if not self.known:
+            return [self]
         parts = self.stages[:2], self.stages[2:]
         return [dataclasses.replace(self, stages=stages) for stages in parts if stages]
 
@@ -206,6 +262,13 @@ def settled(pair: Pair, pose: RelativePose, limit: Float[Array, ""]) -> tuple[Re
     return pose, use & seen(pair, pose, limit)
 
 
+def _chance(pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]) -> Float[Array, ""]:
+    """The chance that a wrong point agrees with a pose."""
+    agreed, asked = evidence.shifted_agreement(pair, pose, limit)
+    spread = evidence.scattered(squares(pair, pose), pair.mask & ~use, limit) / 2
+    return jnp.maximum((agreed + 1) / (asked + 2), spread)
+
+
 def _in_doubt(pair: Pair, pose: RelativePose, use: Use, believed: Bool[Array, ""]) -> Use:
     """The points of which some are wrong, though nothing tells which; of pairs with few points out."""
     out = pair.mask & ~use
@@ -216,6 +279,18 @@ def _in_doubt(pair: Pair, pose: RelativePose, use: Use, believed: Bool[Array, ""
         return undecided(own, pose, use & asked, out & asked & seen(own, pose, 0.0))
 
     return where_needed(asked, found, jnp.zeros_like(use))
+
+
+def _unit(pair: Pair) -> Float[Array, ""]:
+    """By what the standard deviations of a pair are to be multiplied where all are 1, as in one that states none."""
+    stated = count(pair.mask & (pair.sigma != 1)) > 0
+    return jnp.where(stated, 1.0, pair.focal_left / UNKNOWN)
+
+
+def _rescaled(pair: Pair, scale: Float[Array, ""]) -> Pair:
+    """The pair with so many times the standard deviations."""
+    sigma = jnp.where(pair.mask, pair.sigma * scale, 1.0)
+    return Pair(*pair.coordinates, sigma, pair.mask, pair.focal_left, pair.focal_right)
 
 
 def _from_vertical(pair: Pair, steps: int) -> RelativePose:
@@ -239,15 +314,17 @@ def _believed_if_it_fits(
     """The decision for a pose of a quick search, which may have missed a better one.
 
     Points that agree with a wrong pose, as those of one depth do, lie about it as far as the limit reaches, and fail
-    the global test. Others agree by chance with a probability of about limit / mean |r|.
+    the global test. If they pass it by far, sigma is too large for it to tell that. Others agree by chance with a
+    probability of about limit / mean |r|.
     """
     n, k = count(pair.mask), count(use)
     s = squares(pair, pose)
     misfit = total(jnp.where(use, s, 0.0))
-    fits = (misfit <= evidence.chi_squared_limit(DEVIATIONS, k - 5)) & (k >= share * n) & (k > 5)
+    low, high = (evidence.chi_squared_limit(d, k - 5) for d in (-DEVIATIONS, DEVIATIONS))
+    fits = (misfit >= low) & (misfit <= high) & (k >= share * n) & (k > 5)
     out = pair.mask & ~use
     certain = evidence.accidents(evidence.scattered(s, out, limit), n, k) <= math.log(accidents)
-    return Decision(pose, use, fits & (certain | (count(out) == 0)))
+    return Decision(pose, use, fits & (certain | (count(out) == 0)), jnp.ones_like(limit))
 
 
 def _where_open(stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision) -> Decision:
