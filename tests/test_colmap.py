@@ -4,14 +4,18 @@ import shutil
 import sqlite3
 from contextlib import closing
 
+import jax
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import jaxro
+from jaxro import simulation
 from jaxro.cli import app
 from jaxro.io import colmap
 from jaxro.io.colmap_cameras import MODELS, PhotoCamera, photo_points
 from jaxro.io.colmap_database import Database, images_of
+from jaxro.rejection import OUTCOMES, Recommended
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap makes the databases and judges them")
 Config = pycolmap.TwoViewGeometryConfiguration
@@ -75,6 +79,7 @@ def matched(path):
 
 def test_truth_is_found_and_wrong_matches_are_out(scene):
     before, truth, after = scene
+    turns = []
     with pycolmap.Database.open(str(after)) as database:
         for pair_id, matches in matched(before).items():
             a, b = images_of(pair_id)
@@ -90,9 +95,9 @@ def test_truth_is_found_and_wrong_matches_are_out(scene):
             assert len(kept & right_ones) >= 0.99 * len(right_ones) and len(matches) - len(right_ones) > 40
             assert len(kept - right_ones) <= 4
             pose = right.cam_from_world() * left.cam_from_world().inverse()
-            # half a pixel in 1280, 150 points: a tenth of a degree where the base is short
-            assert angle(found.cam2_from_cam1.rotation, pose.rotation) < 0.3
-            assert angle(found.cam2_from_cam1.translation, pose.translation) < 0.3
+            # half a pixel in 1280, 150 points: .27° is the standard deviation of the pair with the shortest base
+            turns.append(angle(found.cam2_from_cam1.rotation, pose.rotation))
+            assert turns[-1] < 0.6 and angle(found.cam2_from_cam1.translation, pose.translation) < 0.3
             rays = [
                 np.c_[
                     image.camera.cam_from_img(np.array([image.points2D[k].xy for k in column])),
@@ -104,6 +109,7 @@ def test_truth_is_found_and_wrong_matches_are_out(scene):
             assert np.sqrt(np.mean(coplanar**2)) < 2 * NOISE / 1280
             k = left.camera.calibration_matrix()
             np.testing.assert_allclose(k.T @ found.F @ k, found.E, atol=1e-12)
+    assert np.median(turns) < 0.12 and np.sqrt(np.mean(np.square(turns))) < 0.2
 
 
 def test_mapper_builds_on_the_geometries(scene, tmp_path):
@@ -245,7 +251,7 @@ def test_every_pair_gets_what_it_is_worth(tmp_path):
     }
     sizes = {name: len(g.inlier_matches) for name, g in found.items()}
     assert sizes["chance"] == sizes["few"] == sizes["none"] == 0 and sizes["ten"] == 12
-    # by LEVEL one pair in three loses a right match, one in two hundred three of them
+    # wrong matches agree by accident where they lie near their epipolar lines; next to no right one is lost
     assert 94 <= sizes["oriented"] <= 99 and 125 <= sizes["plane"] <= 131 and sizes["rotation"] >= 156
     for name in ("oriented", "ten"):
         pose = found[name].cam2_from_cam1
@@ -258,6 +264,61 @@ def test_every_pair_gets_what_it_is_worth(tmp_path):
         seen, wanted = points @ first.T @ found[name].H.T, (points @ turn.T + t) @ second.T
         off = seen[:, :2] / seen[:, 2:] - wanted[:, :2] / wanted[:, 2:]
         assert np.sqrt(np.mean(off**2)) < 2 * NOISE, name
+
+
+def test_poses_and_matches_are_those_of_recommended(tmp_path):
+    """Photos in any position, a fifth to three fifths of 60 to 200 matches wrong; matches of photos that have nothing
+    in common have no consensus in both."""
+    rng, path, points, focal, centre = np.random.default_rng(7), tmp_path / "pairs.db", 224, 1200.0, 1500.0
+    exact, _ = simulation.random_pairs(jax.random.key(7), 12, points, focal=focal)
+    photos = np.stack(exact.coordinates) + rng.normal(0, NOISE, (4, 12, points))
+    photos[:, 9:] = rng.uniform(-1000, 1000, (4, 3, points))
+    numbers, pairs = [], []
+    with pycolmap.Database.open(str(path)) as database:
+        camera = database.write_camera(
+            pycolmap.Camera(
+                model="SIMPLE_PINHOLE",
+                width=3000,
+                height=3000,
+                params=[focal, centre, centre],
+                has_prior_focal_length=True,
+            )
+        )
+        for k, count in enumerate([200, 60, *rng.integers(60, 201, 10).tolist()]):
+            sides = []
+            for x, y in (photos[:2, k, :count], photos[2:, k, :count]):
+                image = pycolmap.Image(name=f"{k}_{len(sides)}.png", camera_id=camera)
+                pixels = np.stack([centre + x, centre - y], axis=-1).astype(np.float32)
+                sides.append((database.write_image(image), pixels))
+                database.write_keypoints(*sides[-1])
+            partner, out = np.arange(count), rng.permutation(count)[: round(rng.uniform(0.2, 0.6) * count)]
+            partner[out] = np.roll(out, 1)
+            matches = np.stack([np.arange(count), partner], axis=-1).astype(np.uint32)
+            database.write_matches(sides[0][0], sides[1][0], matches)
+            numbers.append((sides[0][0], sides[1][0], matches))
+            left, right = (pixels[m].astype(float) for (_, pixels), m in zip(sides, matches.T, strict=True))
+            coordinates = left[:, 0] - centre, centre - left[:, 1], right[:, 0] - centre, centre - right[:, 1]
+            pairs.append(jaxro.pair(*coordinates, focal=focal, sigma=NOISE))
+    assert run(path, "--sigma", NOISE).exit_code == 1
+    lost, mask, pose = jaxro.clean_batch(
+        jaxro.stack(pairs, points),
+        Recommended(),
+        select=lambda r: (r.outcome == OUTCOMES.no_consensus, r.mask, r.orientation.pose),
+    )
+    assert np.all(lost[9:]) and np.sum(lost) <= 4
+    rotation, base = (np.array(part) for part in jax.vmap(lambda pose: pose.relative())(pose))
+    half_turn = np.diag([1.0, -1.0, -1.0])
+    with pycolmap.Database.open(str(path)) as database:
+        for k, (a, b, matches) in enumerate(numbers):
+            found = database.read_two_view_geometry(a, b)
+            if lost[k]:
+                assert found.config == Config.DEGENERATE and len(found.inlier_matches) == 0
+                continue
+            np.testing.assert_array_equal(found.inlier_matches, matches[mask[k, : len(matches)]])
+            turn = half_turn @ rotation[:, :, k].T @ half_turn
+            assert found.config == Config.CALIBRATED
+            np.testing.assert_allclose(found.cam2_from_cam1.rotation.matrix(), turn, atol=1e-9)
+            np.testing.assert_allclose(found.cam2_from_cam1.translation, -turn @ half_turn @ base[:, k], atol=1e-9)
 
 
 PARAMETERS = {

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from ..padding import sizes
+from ..padding import SIZES, sizes
 from ..pairs import Pair, stack
 
 
@@ -40,10 +40,10 @@ def each(
                 yield i, jax.tree.map(lambda a, row=row: a[row], found)
 
 
-def buckets(lengths: list[int]) -> dict[int, list[int]]:
-    """Indices of the pairs to be padded to each of `padding.sizes`."""
+def buckets(lengths: list[int], most: int = SIZES) -> dict[int, list[int]]:
+    """Indices of the pairs to be padded to each of `padding.sizes`, at most so many."""
     known = np.asarray(lengths, int)
-    chosen = sizes(known)
+    chosen = sizes(known, most)
     place = np.searchsorted(chosen, known)
     every = {size: np.flatnonzero(place == k).tolist() for k, size in enumerate(chosen)}
     return {size: members for size, members in every.items() if members}

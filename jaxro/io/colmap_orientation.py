@@ -1,17 +1,14 @@
-"""The orientation of image pairs from automatic matches, a good part of them wrong, photos in any position.
+"""What the orientation of an image pair from its automatic matches is worth.
 
-1. A search by random subsets on at most SEARCHED matches, evenly taken: of eight points, solved linearly.
-2. All matches are judged anew by |w| at the familywise LEVEL, in turns with least squares. A match whose rays meet
-   behind a photo is wrong, unless they are parallel within their errors.
-3. Where the subsets tried do not suffice for the share of matches that is kept, or the pair is not oriented by them
-   (eight points of a plane determine nothing), the same with subsets of five points. They suffice when a better pose
-   would have been met with the probability `confidence`: many good points agree with wrong poses, too, so that their
-   number alone does not prove a pose.
-4. The set that is left is believed if sets as good are not expected by accident (Moisan and Stival 2004):
+Pose and kept matches are those of the procedure `recommended`, unchanged where the pair is `oriented`. What is told
+here besides is what they mean:
 
-       C(n, k) C(k, 5) p^(k-5) (n - 5) < ACCIDENTS,
-
-   p the share of matches that agree when every point is given the partner of another one.
+1. Where most matches lie in one plane, they have a second pose (`planes`), which replaces the first one if it has more
+   of them in front of both photos.
+2. Where the rotation alone explains the matches, there is no base, and whatever base was found is an accident.
+3. Matches that repeat others are no evidence, and of automatic matches some are wrong from the start: that all of them
+   fit proves nothing if they are few. The kept set is believed if sets as good are not expected by accident
+   (`rejection.evidence`), by the share of matches that agree when every point is given the partner of another one.
 """
 
 import enum
@@ -21,41 +18,29 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float, Int
 
-from .. import critical_values, rotations as rot
+from .. import critical_values, planes, rotations as rot
 from ..elements import RelativePose
-from ..normal_equations import accumulate, solve
-from ..orientation import orient
 from ..pairs import Pair, cleaned
-from ..reductions import count
-from ..rejection.hypotheses import EightPoint, FivePoint, moved_up, squares, vectors
-from ..rejection.ransac import Ransac
-from ..rejection.robust import agreeing, improved, in_front, parallel, seen
+from ..programs import while_loop
+from ..reductions import count, total
+from ..rejection import OUTCOMES, Recommended, Rejection, evidence
+from ..rejection.hypotheses import squares, vectors
+from ..rejection.robust import agreeing, in_front, parallel, seen
 from ..results import RESULTS, is_usable
 from ..starts.general import rotation_only
 
-SEARCHED = 256
-EIGHT = Ransac(EightPoint(block=32), count=128, confidence=0.9, limit=5.0)
-FIVE = Ransac(FivePoint(block=16), count=1024, confidence=0.99, limit=5.0)
-"""Enough down to a third of right matches."""
+ENGINE = Recommended()
+"""The procedure that decides on pose and matches; the standard deviations are those of the matches."""
 
-LEVEL = 0.3
-"""Probability that a pair without wrong matches loses one: there are many, and each wrong one that is kept costs more.
-"""
+ACCIDENTS = 1e-3
+"""Sets as good that may be expected by accident: as many as the engine allows."""
 
-SLACK = 0.1
 ROUNDS = 10
-STEPS = 3
-WIDE = 3.0
-SHIFTS, TRIALS = 8, 4096
-"""Other partners that each point is given: at least so many, more where there are few points, to make so many trials.
-"""
+"""Turns of least squares and judgement for the second pose of a plane scene."""
 
-ACCIDENTS = 1e-4
 TURNS = 3
 """Of the rotation without a base, each by the matches that the last one takes along."""
 
@@ -63,7 +48,7 @@ ALIKE, CHANCE = 3.0, 0.05
 """Wrong matches that agree on a base chosen for them, and the share of the others that agree by chance."""
 
 PLANE = 0.8
-"""Share of the kept matches in a plane from which on that plane alone determines the pose."""
+"""Share of the matches that agree with a pose from which on the plane they lie in alone determines it."""
 
 
 class Kind(enum.IntEnum):
@@ -90,47 +75,89 @@ class Found(eqx.Module):
     kind: Int[Array, "*pairs"]
 
 
+class Verdict(NamedTuple):
+    """What the engine says of a pair: matches kept, the pose by them and how that ended, and the outcome."""
+
+    mask: Bool[Array, "*pairs match"]
+    pose: RelativePose
+    result: RESULTS
+    outcome: OUTCOMES
+
+
 class Plane(NamedTuple):
-    """n, the points that lie in the plane, and the share they are."""
+    """The pose of most matches in front of both photos, its matches, the plane nearest to them, and whether that plane
+    alone determines the pose."""
 
+    pose: RelativePose
+    use: Bool[Array, "match"]
     normal: Float[Array, "3"]
-    within: Bool[Array, "match"]
-    share: Float[Array, ""]
+    alone: Bool[Array, ""]
 
 
-def searched(pair: Pair, search: Ransac) -> tuple[RelativePose, Int[Array, ""]]:
-    """The pose of most matches, and the number of subsets tried."""
-    found = search.found(cleaned(pair)[0])
-    return found.pose, found.blocks * search.hypotheses.block
+def verdict(rejection: Rejection) -> Verdict:
+    """The part of a rejection that is needed here."""
+    solved = rejection.orientation
+    return Verdict(rejection.mask, solved.pose, solved.result, rejection.outcome)
 
 
-def suffices(
-    search: Ransac, tried: Int[np.ndarray, "pair"], kept: Int[np.ndarray, "pair"], of: Int[np.ndarray, "pair"]
-):
-    """Whether so many subsets are enough for the share of matches kept, the search having kept up to SLACK more."""
-    share = np.clip(kept / np.maximum(of, 1) + SLACK, 1e-3, 1 - 1e-9)
-    return tried * np.log1p(-(share**search.hypotheses.size)) <= math.log1p(-search.confidence)
-
-
-def judged(pair: Pair, pose: RelativePose) -> Found:
-    """All matches of a pair judged by the pose of a search."""
+def classified(pair: Pair, verdict: Verdict) -> Found:
+    """What the verdict of the engine on a pair is worth."""
     pair = cleaned(pair)[0]
-    each = lambda n: critical_values.normal(LEVEL / jnp.maximum(n, 1.0))
+    each = lambda n: critical_values.normal(ENGINE.level / jnp.maximum(n, 1.0))
     limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
-    within = lambda pose, factor: pair.mask & (squares(pair, pose) <= (factor * limit) ** 2)
-    # a subset's pose is the worse the weaker the layout: it moves on points from further away before it judges them
-    nearer = lambda k, pose: improved(pair, pose, within(pose, WIDE - k * (WIDE - 1) / STEPS))
-    pose = lax.fori_loop(0, STEPS, nearer, pose)
-    pose = visible(pair, pose, within(pose, 1.0), limit)
-    pose, use = agreeing(pair, pose, within(pose, 1.0), limit, ROUNDS)
-    use = use & seen(pair, pose, limit)
-    solved = orient(pair.with_mask(use), start=pose)
-    pose, result = solved.pose, solved.result
-    normal, _, share = plane(pair, pose, use, limit)
-    kind = jnp.where(share < PLANE, int(Kind.oriented), int(Kind.plane))
-    weak = result == RESULTS.weakly_determined
+    plane = in_plane(pair, verdict.pose, verdict.mask, limit)
+    pose, use, turned = without_base(pair, plane.pose, plane.use, verdict.result, limit)
+    weak = verdict.result == RESULTS.weakly_determined
     # what lies behind a photo here is infinitely far for its errors
-    fair = is_usable(result) | weak | (result == RESULTS.points_behind_camera)
+    fair = is_usable(verdict.result) | weak | (verdict.result == RESULTS.points_behind_camera)
+    # any base is as good as another one where there is none, so that the engine may well doubt the one it found
+    convinced = turned | (fair & (verdict.outcome != OUTCOMES.no_consensus))
+    kind = jnp.where(plane.alone, int(Kind.plane), int(Kind.oriented))
+    for holds, other in (
+        (weak & ~plane.alone, Kind.weak),
+        (turned, Kind.rotation),
+        (~convinced | ~certain(pair, pose, use, limit), Kind.no_consensus),
+        (count(pair.mask) < 6, Kind.too_few),
+    ):
+        kind = jnp.where(holds, int(other), kind)
+    return Found(
+        kept=use & (kind < int(Kind.no_consensus)),
+        quaternion=pose.quaternion,
+        rotation=rot.as_array(pose.relative()[0]),
+        base=pose.base,
+        normal=plane.normal,
+        sigma0=sigma0(pair, pose, use),
+        kind=kind,
+    )
+
+
+def in_plane(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit: Float[Array, ""]) -> Plane:
+    """Whether most matches lie in one plane; if so the second pose in place of the first one, with the matches that
+    agree with it, where it has more of them in front of both photos."""
+    # those, too, that were rejected for lying behind a photo
+    agree = use | (pair.mask & (squares(pair, pose) <= limit**2))
+    flat = planes.plane(pair, pose, agree, limit)
+    alone = flat.share >= PLANE
+
+    def once(state):
+        needed, first = state
+        # depends on the round, or it would be computed of every scene
+        inside = cleaned(pair.with_mask(pair.mask & needed))[0]
+        other, exists = planes.second(inside.with_mask(inside.mask & flat.within), pose, flat.normal)
+        more = count(flat.within & in_front(inside, other)) > count(flat.within & in_front(inside, pose))
+        other, others = agreeing(inside, other, inside.mask & flat.within, limit, ROUNDS)
+        others = others & seen(inside, other, limit)
+        new = Plane(other, others, planes.plane(inside, other, others, limit).normal, alone)
+        return needed & False, jax.tree.map(lambda a, b: jnp.where(needed & exists & more, a, b), new, first)
+
+    first = Plane(pose, use, flat.normal, alone)
+    return while_loop(lambda state: state[0], once, (alone, first), pair.focal_left)[1]
+
+
+def without_base(
+    pair: Pair, pose: RelativePose, use: Bool[Array, "match"], result: RESULTS, limit: Float[Array, ""]
+) -> tuple[RelativePose, Bool[Array, "match"], Bool[Array, ""]]:
+    """The rotation without a base and its matches where it explains the matches in use, and whether it does."""
     # a large sigma0 hides a base, too: the rays themselves have to be parallel, by the rotation alone. Without a base
     # any will do, and then it is one that some wrong matches agree on: their parallaxes are no proof of it
     turns = lambda _, still: parallel(pair, rotation_only(*vectors(pair), use & still)[0], limit)
@@ -138,107 +165,22 @@ def judged(pair: Pair, pose: RelativePose) -> Found:
     rotated = rotation_only(*vectors(pair), use & still)[0]
     few = count(use & ~still) <= ALIKE + CHANCE * count(pair.mask & ~still)
     turned = ((result == RESULTS.zero_base) | few) & (count(use & still) >= PLANE * count(use))
-    pose = jax.tree.map(lambda a, b: jnp.where(turned, a, b), rotated, pose)
-    use = jnp.where(turned, still, use)
-    believed = accidents(pair, pose, use, limit) < math.log(ACCIDENTS)
-    for holds, other in (
-        (~fair | ~believed, Kind.no_consensus),
-        (believed & weak & (share < PLANE), Kind.weak),
-        (believed & turned, Kind.rotation),
-        (count(pair.mask) < 6, Kind.too_few),
-    ):
-        kind = jnp.where(holds, int(other), kind)
-    rotation = rot.as_array(pose.relative()[0])
-    kept = use & (kind < int(Kind.no_consensus))
-    return Found(kept, pose.quaternion, rotation, pose.base, normal, solved.sigma0, kind)
+    pose, use = jax.tree.map(lambda a, b: jnp.where(turned, a, b), (rotated, still), (pose, use))
+    return pose, use, turned
 
 
-def plane(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> Plane:
-    """The plane nearest to the points in use: n of c x p1 = (c x b) (n · p1), c = R p2, linear, in three turns in which
-    points off it lose their weight. A point lies in it if the homography p2 ~ Rᵀ (p1 - b (n · p1)) takes p1 to p2
-    within the limit."""
-    rotation, base = pose.relative()
-    back = rot.transpose(rotation)
-
-    def inverse_depth(point):
-        x1, y1, x2, y2 = point
-        p = (x1 / pair.focal_left, y1 / pair.focal_left, -jnp.ones_like(x1))
-        c = rot.apply(rotation, (x2 / pair.focal_right, y2 / pair.focal_right, -jnp.ones_like(x2)))
-        across = rot.cross(c, base)
-        squared = rot.dot(across, across)
-        return *p, rot.dot(across, rot.cross(c, p)) / jnp.where(squared > 0, squared, 1.0), squared
-
-    def squared(point, sigma, normal):
-        x1, y1, x2, y2 = point
-        p = (x1 / pair.focal_left, y1 / pair.focal_left, -jnp.ones_like(x1))
-        nearness = rot.dot(normal, p)
-        x, y, z = rot.apply(back, (p[0] - base[0] * nearness, p[1] - base[1] * nearness, p[2] - base[2] * nearness))
-        safe = jnp.where(z < 0, z, -1.0)
-        off = (pair.focal_right * x / -safe - x2) ** 2 + (pair.focal_right * y / -safe - y2) ** 2
-        return jnp.where(z < 0, off / (2 * sigma**2), jnp.inf)
-
-    *columns, target, sure = jax.vmap(inverse_depth)(pair.coordinates)
-    errors = jax.vmap(squared, in_axes=(0, 0, None))
-
-    def turn(_, normal):
-        s = errors(pair.coordinates, pair.sigma, normal) / limit**2
-        weight = jnp.where(use, sure / (1 + jnp.minimum(s, 1e6)), 0.0)
-        n, h, _ = accumulate([target], [[c] for c in columns], [weight])
-        return tuple(solve(n, h))
-
-    zero = jnp.zeros_like(pair.focal_left)
-    n, h, _ = accumulate([target], [[c] for c in columns], [jnp.where(use, sure, 0.0)])
-    normal = lax.fori_loop(0, 2, turn, tuple(solve(n, h)))
-    within = use & (errors(pair.coordinates, pair.sigma, normal) <= limit**2)
-    finite = jnp.stack([jnp.where(jnp.isfinite(c), c, zero) for c in normal])
-    return Plane(finite, within, count(within) / jnp.maximum(count(use), 1.0))
+def certain(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether so many matches, each counted once, do not agree by accident."""
+    again, _ = evidence.repeats(pair)
+    once = cleaned(pair.with_mask(pair.mask & ~again))[0]
+    agreed, asked = evidence.shifted_agreement(once, pose, limit)
+    chance = (agreed + 1) / (asked + 2)
+    return evidence.accidents(chance, count(once.mask), count(use & once.mask)) <= math.log(ACCIDENTS)
 
 
-def visible(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> RelativePose:
-    """Of a plane scene the pose that has more points in front of both photos; of other scenes the pose as it is.
-
-    A homography Rᵀ A, A = I - b nᵀ, belongs to two poses (Longuet-Higgins 1986), because AᵀA = I + n wᵀ + w nᵀ, w =
-    n/2 - b, is the same for n and w exchanged: n' = w, b' = β w / 2 - n, R' = (A A'⁻¹)ᵀ R with det A' = det A.
-    """
-    normal, use, share = plane(pair, pose, use, limit)
-    rotation, base = pose.relative()
-    n, b = (normal[0], normal[1], normal[2]), base
-    w = (n[0] / 2 - b[0], n[1] / 2 - b[1], n[2] / 2 - b[2])
-    det = 1 - rot.dot(b, n)
-    there = (det > 1e-6) & (rot.dot(w, w) > 1e-12) & (share >= PLANE)
-    det, square = jnp.where(there, det, 1.0), jnp.where(there, rot.dot(w, w), 1.0)
-    beta = 2 * (1 + rot.dot(n, w) - det) / square
-    other = (beta / 2 * w[0] - n[0], beta / 2 * w[1] - n[1], beta / 2 * w[2] - n[2])
-    eye = rot.identity(det)
-    first = tuple(tuple(e - b[i] * n[j] for j, e in enumerate(row)) for i, row in enumerate(eye))
-    second = tuple(tuple(e + other[i] * w[j] / det for j, e in enumerate(row)) for i, row in enumerate(eye))
-    turned = rot.product(rot.transpose(rot.product(first, second)), rotation)  # pyright: ignore[reportArgumentType]
-    length = jnp.sqrt(rot.dot(other, other))
-    there = there & (length > 1e-6)
-    unit = (c / jnp.where(there, length, 1.0) for c in other)
-    twin = RelativePose(*rot.to_quaternion(turned), *unit).normalised()
-    fine = there & jnp.isfinite(sum(jax.tree.leaves(twin)))
-    twin = jax.tree.map(lambda a, b: jnp.where(fine, a, b), twin, pose)
-    better = count(use & in_front(pair, twin)) > count(use & in_front(pair, pose))
-    return jax.tree.map(lambda a, b: jnp.where(better, a, b), improved(pair, twin, use), pose)
-
-
-def accidents(pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit) -> Float[Array, ""]:
-    """Logarithm of the expected number of sets as good by accident."""
-    rows, n, k = moved_up(pair), count(pair.mask), count(use)
-    size = rows.shape[0]
-    there = jnp.arange(size, dtype=n.dtype) < n
-    shifts = max(min(max(SHIFTS, TRIALS // size), size - 1), 1)
-
-    def shifted(i, sums):
-        # the places are turned, the empty ones with them: a shift by the number of points would have to gather
-        x, y, also = (lax.dynamic_slice_in_dim(a, 1 + i * (size - 1) // shifts, size) for a in twice)
-        mixed = Pair(rows[:, 0], rows[:, 1], x, y, pair.sigma, there & also, pair.focal_left, pair.focal_right)
-        agree = mixed.mask & (squares(mixed, pose) <= limit**2)
-        return tuple(a + count(b) for a, b in zip(sums, (agree, mixed.mask), strict=True))
-
-    twice = [jnp.concatenate([a, a]) for a in (rows[:, 2], rows[:, 3], there)]
-    agree, trials = lax.fori_loop(0, shifts, shifted, (n * 0, n * 0))
-    p = (agree + 1) / (trials + 2)
-    choices = gammaln(n + 1) - gammaln(n - k + 1) - gammaln(6.0) - gammaln(jnp.maximum(k, 5.0) - 4)
-    return jnp.where(k > 5, choices + (k - 5) * jnp.log(p) + jnp.log(jnp.maximum(n - 5, 1.0)), jnp.inf)
+def sigma0(pair: Pair, pose: RelativePose, use: Bool[Array, "match"]) -> Float[Array, ""]:
+    """The estimated standard deviation of unit weight, every match kept with its full weight: that of the engine's own
+    solution is too small where the weights fade."""
+    freedom = count(use) - 5
+    square = total(jnp.where(use, squares(pair, pose), 0.0)) / jnp.maximum(freedom, 1.0)
+    return jnp.where(freedom > 0, jnp.sqrt(square), 0.0)
