@@ -37,7 +37,7 @@ from .graduated_non_convexity import GraduatedNonConvexity
 from .hypotheses import Newton, squares
 from .noise import noise_of
 from .ransac import Ransac
-from .robust import agreeing, improved, judged, normalised, one_by_one, scaled, seen
+from .robust import agreeing, improved, judged, normalised, one_by_one, reweighted, scaled, seen
 from .search import Found, Search, score
 from .undecided import undecided
 
@@ -60,10 +60,13 @@ OVERWHELMING = math.log(1e-9)
 
 
 APART = 0.6
-"""Ratio of the noise found to the noise taken below which a search begins again with what was found."""
+"""Ratio of the noise found to that taken, or of that taken to that found, below which a search begins again."""
 
-LEAST, MOST = 0.05, 20.0
-"""Bounds of the noise found, as multiples of the noise taken at first."""
+NARROWER, NARROWINGS = 0.7, 12
+"""By how much the limit narrows in two steps, and how many steps: down to an eighth."""
+
+MOST = 20.0
+"""How many times larger or smaller than that taken at first the noise may be."""
 
 UNKNOWN = 3000.0
 """Where nothing is said of the noise, a search begins with this part of the focal length."""
@@ -123,8 +126,8 @@ class Thorough(AbstractStage):
     have on this scene. Points that repeat others count once. The search ends when no set that it could still find would
     be believed, after at least `least` subsets, so that the pose is as good as it can be where nothing is believed.
 
-    Where the residuals show a much smaller noise than was taken, the search begins again with that. Where sigma is not
-    `known`, a larger one as well, and the points are judged by the noise found.
+    Where the residuals leave no doubt that sigma is much too large, the search begins again with the noise that they
+    show, by which the points are then judged, too; where sigma is not `known` they always are.
     """
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
@@ -146,7 +149,6 @@ class Thorough(AbstractStage):
         at_once = at_once._replace(believed=at_once.believed & self.known)
 
         found, scale = self._searched(once, first, ~at_once.believed, limit)
-        scale = jnp.ones_like(scale) if self.known else scale
         once = _rescaled(once, scale)
         pose, use = settled(once, found.pose, limit)
         chance = jnp.maximum(_chance(once, pose, use, limit), found.agreed / jnp.maximum(found.asked, 1.0))
@@ -161,18 +163,20 @@ class Thorough(AbstractStage):
     def _searched(
         self, pair: Pair, first: RelativePose, wanted: Bool[Array, ""], limit: Float[Array, ""]
     ) -> tuple[Found, Float[Array, ""]]:
-        """The search from a first pose, where it is wanted, and the noise found by it, as a multiple of that stated."""
-        least = LEAST if self.known else 1 / MOST
-        most = 1.0 if self.known else MOST
+        """The search from a first pose, where it is wanted, and the noise to judge by, as a multiple of that stated."""
 
         def turn(state):
             k, _, scale, found = state
             own = _rescaled(pair, scale)
             found = self.search.run(own, self.search.begin(own, found.pose), self._worth(own, found.pose, limit))
-            noise = noise_of(squares(pair, found.pose), pair.mask)
-            new = jnp.clip(jnp.where(noise.known, noise.sigma, scale), least, most)
+            narrowed = _narrowed(own, found.pose, self.search.limit)
+            noise = noise_of(squares(pair, narrowed), pair.mask)
+            upper = noise.sigma * (1 + DEVIATIONS / jnp.sqrt(2 * jnp.maximum(noise.redundancy, 0.5)))
+            taken = noise.known & ((upper < APART * scale) | (not self.known))
+            new = jnp.where(taken, jnp.clip(noise.sigma, 1 / MOST, MOST), scale)
             apart = (new < APART * scale) | (scale < APART * new)
-            return k + 1, apart, new, found
+            pose = jax.tree.map(lambda a, b: jnp.where(apart, a, b), narrowed, found.pose)
+            return k + 1, apart, new, found._replace(pose=pose)
 
         one = jnp.ones_like(limit)
         start = jnp.zeros((), int), wanted, one, self.search.begin(pair, first)
@@ -279,6 +283,18 @@ def _in_doubt(pair: Pair, pose: RelativePose, use: Use, believed: Bool[Array, ""
         return undecided(own, pose, use & asked, out & asked & seen(own, pose, 0.0))
 
     return where_needed(asked, found, jnp.zeros_like(use))
+
+
+def _narrowed(pair: Pair, pose: RelativePose, limit: float) -> RelativePose:
+    """The pose that the points near it lead to, as the limit within which they count narrows (graduated weights of
+    Geman and McClure): where sigma is too large, wrong points within the limit hide the right pose from a search."""
+
+    def step(k, pose):
+        width = limit * NARROWER ** (k / 2)
+        return reweighted(pair, pose, lambda s: 1 / (1 + s / width**2) ** 2)
+
+    steps = jnp.arange(NARROWINGS, dtype=pair.focal_left.dtype)
+    return lax.scan(lambda pose, k: (step(k, pose), None), pose, steps)[0]
 
 
 def _unit(pair: Pair) -> Float[Array, ""]:
