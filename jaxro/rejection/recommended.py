@@ -65,6 +65,9 @@ APART = 0.6
 NARROWER, NARROWINGS = 0.7, 12
 """By how much the limit narrows in two steps, and how many steps: down to an eighth."""
 
+MAJORITY = 0.4
+"""Part of the points that agreed before that the noise has to be that of: a few points may agree by accident."""
+
 MOST = 20.0
 """How many times larger or smaller than that taken at first the noise may be."""
 
@@ -172,7 +175,8 @@ class Thorough(AbstractStage):
             narrowed = _narrowed(own, found.pose, self.search.limit)
             noise = noise_of(squares(pair, narrowed), pair.mask)
             upper = noise.sigma * (1 + DEVIATIONS / jnp.sqrt(2 * jnp.maximum(noise.redundancy, 0.5)))
-            taken = noise.known & ((upper < APART * scale) | (not self.known))
+            most = noise.redundancy >= MAJORITY * count(squares(own, found.pose) <= self.search.limit**2)
+            taken = noise.known & most & ((upper < APART * scale) | (not self.known))
             new = jnp.where(taken, jnp.clip(noise.sigma, 1 / MOST, MOST), scale)
             apart = (new < APART * scale) | (scale < APART * new)
             pose = jax.tree.map(lambda a, b: jnp.where(apart, a, b), narrowed, found.pose)
