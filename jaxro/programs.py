@@ -262,7 +262,7 @@ def while_loop(more: Callable, turn: Callable, state: PyTree, like: Array) -> Py
     return jax.lax.while_loop(more, turn, jax.tree.map(lambda a: jax.lax.select(always, a, a), state))
 
 
-def where_needed(needed: Array, function: Callable[[Array], PyTree], otherwise: PyTree) -> PyTree:
+def if_needed(needed: Array, function: Callable[[Array], PyTree], otherwise: PyTree) -> PyTree:
     """`function`(needed) where it is needed, else `otherwise`: computed under `vmap` only if some pair needs it.
 
     It is a loop of at most one turn. What `function` works on has to depend on its argument (a mask, say), or the

@@ -16,7 +16,7 @@ from jaxro import simulation
 from jaxro.rejection import OUTCOMES, AllSubsets, DataSnooping, GraduatedNonConvexity, Recommended
 
 RECOMMENDED = Recommended(sigma=0.01)
-NEAR = dataclasses.replace(RECOMMENDED, stages=RECOMMENDED.stages[:3], level=0.01)
+NEAR = dataclasses.replace(RECOMMENDED, stages=RECOMMENDED.stages[:2], level=0.01)
 """Without the search for photos in any position, which takes long to compile."""
 
 

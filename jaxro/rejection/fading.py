@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from ..conditions import linearised
 from ..elements import RelativePose
 from ..pairs import Pair
-from ..programs import where_needed
+from ..programs import if_needed
 from ..reductions import count, total
 from .hypotheses import squares
 from .robust import stepped
@@ -48,7 +48,7 @@ def faded(pair: Pair, pose: RelativePose, use: Use) -> Pair:
     mean, fourth = total(s) / k, total(s * s) / k
     heavy = (fourth > mean**2 * (3 + HEAVY * jnp.sqrt(24 / k))) | ((near > EXPECTED) & (k >= MANY))
     one = jnp.ones_like(every)
-    factor = where_needed(heavy, lambda needed: _factors(fixed, pose, use & needed), one)
+    factor = if_needed(heavy, lambda needed: _factors(fixed, pose, use & needed), one)
     return Pair(*pair.coordinates, pair.sigma * factor, pair.mask, pair.focal_left, pair.focal_right)
 
 
