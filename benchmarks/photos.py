@@ -132,7 +132,8 @@ def recommended(factor: float = 1.0, procedure: Recommended | None = None) -> Pr
         begin = time.process_time()
         (rotation, base), outcome, usable, kept = jax.block_until_ready(clean())
         seconds = (time.process_time() - begin) / len(pairs.focal)
-        claimed = np.asarray(usable) & (np.asarray(outcome) == int(OUTCOMES.finished._value))
+        believed = np.isin(np.asarray(outcome), [int(o._value) for o in (OUTCOMES.finished, OUTCOMES.undecided)])
+        claimed = np.asarray(usable) & believed
         turned = np.moveaxis(np.array(rotation), (0, 1), (-2, -1))
         return Found(turned, np.moveaxis(np.array(base), 0, -1), claimed, np.asarray(kept), seconds)
 

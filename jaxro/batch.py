@@ -158,13 +158,7 @@ def clean_batch(
     `select=lambda r: r.mask` computes no log and no statistics that the decision does not need.
     """
     host, report, way = jax.tree.map(np.asarray, double(pairs)), progress or unheard, Way(threads, chunk)
-    first, *others = stages(procedure, pairs.x_left.shape[-1])
-    out, again = decided(host, first, select, way, report)
-    for stage in others:
-        rest = np.flatnonzero(again)
-        if rest.size:
-            left_over = jax.tree.map(lambda a, rest=rest: a[rest], host)
-            out, again = _replaced((out, again), rest, decided(left_over, stage, select, way, unheard))
+    out = decided_in_stages(host, procedure, select, way, report)
     return _finish(out)
 
 
@@ -172,6 +166,20 @@ def stages(procedure: AbstractProcedure, points: int) -> Sequence[AbstractProced
     """The procedures to be tried in turn on pairs of up to so many points, each on those that the one before left in
     doubt."""
     return procedure.separate(points) if isinstance(procedure, Recommended) else (procedure,)
+
+
+def decided_in_stages(
+    pairs: Pair, procedure: AbstractProcedure, select: Callable[[Rejection], PyTree], way: Way, report: Report
+) -> PyTree:
+    """What is selected of every pair's rejection, in NumPy: the stages in turn, each for the pairs left in doubt."""
+    first, *others = stages(procedure, pairs.x_left.shape[-1])
+    out, again = decided(pairs, first, select, way, report)
+    for stage in others:
+        rest = np.flatnonzero(again)
+        if rest.size:
+            left_over = jax.tree.map(lambda a, rest=rest: a[rest], pairs)
+            out, again = _replaced((out, again), rest, decided(left_over, stage, select, way, unheard))
+    return out
 
 
 def decided(

@@ -8,6 +8,7 @@ import numpy as np
 import oracles_robust as judge
 import problems
 import pytest
+import scenes
 import scipy.stats
 from workload import FOCAL, aerial, any_position, with_wrong_points
 
@@ -17,7 +18,7 @@ from jaxro.rejection import OUTCOMES, AllSubsets, DataSnooping, GraduatedNonConv
 
 RECOMMENDED = Recommended(sigma=0.01)
 NEAR = dataclasses.replace(RECOMMENDED, stages=RECOMMENDED.stages[:2], level=0.01)
-"""Without the search for photos in any position, which takes long to compile."""
+"""Without the search for photos in any position, which takes long to compile; it leaves open what needs one."""
 
 
 def verdict(rejection):
@@ -51,12 +52,16 @@ def layout_of_1989(count: int, seed: int):
 @pytest.mark.parametrize("count", [24, pytest.param(1024, marks=pytest.mark.slow)])
 def test_of_few_points_no_other_choice_costs_less(count):
     """16 points, three wrong by 1 to 10 mm: of all choices of up to five omissions, those of the least cost, in NumPy
-    linear about the solution of the good points."""
+    linear about the solution of the good points. Of a few pairs another choice is as likely, and they are undecided."""
     photos, wrong = with_wrong_points(aerial(count, 16, seed=4), 0.2, seed=4)
-    mask, lost = kept(jaxro.pair(*photos, focal=FOCAL), RECOMMENDED)
+    select = lambda r: (r.mask, r.outcome == OUTCOMES.undecided, r.outcome == OUTCOMES.no_consensus)
+    pairs = jaxro.pair(*photos, focal=FOCAL)
+    mask, doubt, lost = map(np.asarray, jaxro.clean_batch(pairs, RECOMMENDED, select=select))
+    assert np.mean(doubt) < 0.01
     use = np.array([~np.isin(np.arange(16), out) for k in range(6) for out in combinations(range(16), k)], float)
     cut = scipy.stats.norm.isf(RECOMMENDED.level / 16 / 2) ** 2 + np.log(16 / 11)
-    for points, good, found in zip(np.stack(photos, axis=1), ~wrong, mask, strict=True):
+    decided = ~doubt
+    for points, good, found in zip(np.stack(photos, axis=1)[decided], ~wrong[decided], mask[decided], strict=True):
         elements = judge.solved(points, FOCAL, 0.01, good.astype(float), np.zeros(5))
         r, a = judge.linearised(points, FOCAL, 0.01, elements)
         n = np.einsum("ci,ij,ik->cjk", use, a, a, optimize=True)
@@ -69,7 +74,8 @@ def test_of_few_points_no_other_choice_costs_less(count):
 
 @pytest.mark.slow
 def test_small_errors_as_by_data_snooping_or_better_and_the_table_of_1971():
-    """At the same rate of false alarms at least as many pairs are cleaned perfectly; six wrong points of 16 go."""
+    """At the same rate of false alarms at least as many pairs are cleaned perfectly. Of the 16 points of the table four
+    repeat others, and six of the twelve that are left are wrong: the other six are too few to prove anything."""
     count = 2047
     clean, measured, wrong = layout_of_1989(count, seed=21)
     six = np.stack(problems.table_1(16).coordinates)[:, None]
@@ -77,14 +83,14 @@ def test_small_errors_as_by_data_snooping_or_better_and_the_table_of_1971():
     clean = jaxro.pair(*np.concatenate([clean, clean[:, :1]], axis=1), focal=70.0)
     shares = {}
     for name, procedure in (
-        ("recommended", NEAR),
+        ("recommended", dataclasses.replace(RECOMMENDED, level=0.01)),
         ("snooping", DataSnooping(sigma=0.01, level=0.01, familywise=True)),
     ):
         alarms = (~kept(clean, procedure)[0]).any(axis=1)
         mask, lost = kept(with_table, procedure)
         shares[name] = alarms.mean(), (mask[:count] == ~wrong).all(axis=1).mean()
         if name == "recommended":
-            assert list(np.flatnonzero(~mask[count]) + 1) == [7, 8, 9, 10, 15, 16] and not lost[count]
+            assert lost[count]
             assert lost[:count].mean() < 0.004  # of 8,192 pairs .0023: four points out, by little
     noise = 2 * np.sqrt(0.01 / count)
     assert abs(shares["recommended"][0] - shares["snooping"][0]) < noise and shares["recommended"][0] < 0.01 + noise
@@ -100,7 +106,7 @@ def test_a_fifth_and_half_of_250_points_wrong(count, share, least):
     measured = np.stack(aerial(count, 250, sigma=0.0005, seed=5))
     wrong = np.argsort(rng.random((count, 250)), 1) < round(share * 250)
     measured[3] += wrong * rng.choice([-1, 1], wrong.shape) * rng.uniform(0.012, 0.290, wrong.shape)
-    mask, lost = kept(jaxro.pair(*measured, focal=FOCAL), dataclasses.replace(NEAR, sigma=0.0005, level=0.001))
+    mask, lost = kept(jaxro.pair(*measured, focal=FOCAL), dataclasses.replace(RECOMMENDED, sigma=0.0005, level=0.001))
     exact = (mask == ~wrong).all(axis=1)
     assert exact.mean() >= min(least, 1 - 1.5 / count) and not lost.any()
 
@@ -134,3 +140,38 @@ def test_matches_of_other_points_in_any_position():
     angle = 2 * np.arccos(np.minimum(np.abs(np.sum(turned[0] * turned[1], axis=0)), 1))
     assert np.mean(usable) >= 0.99
     assert np.all(angle[np.asarray(usable)] < np.deg2rad(0.1))
+
+
+def test_no_target_of_a_regular_field_is_rejected_for_a_wrong_pose():
+    """Walls and boards of targets, photos in any position, no wrong point: a part of a field, or its plane, may fit a
+    pose that is far off. Where all targets lie in one plane, which has two poses, that is told."""
+    fields = scenes.target_fields(96)
+    pairs = jaxro.pair(
+        *fields.coordinates, focal=fields.focal, sigma=np.float64(scenes.TARGET_SIGMA), mask=fields.there
+    )
+
+    def select(r):
+        solved = r.orientation
+        return r.outcome == OUTCOMES.no_consensus, r.mask, solved.result == jaxro.RESULTS.two_solutions, solved.pose
+
+    lost, mask, told, pose = jaxro.clean_batch(pairs, Recommended(), select=select)
+    lost, mask, told = map(np.asarray, (lost, mask, told))
+    base = np.stack(jax.vmap(lambda pose: pose.relative()[1])(pose), axis=-1)
+    chord = np.sum((base - fields.base) ** 2, axis=-1)
+    off = chord > np.deg2rad(1) ** 2
+    assert not np.any(off & ~lost & ~told)
+    assert np.mean(told) < 0.1 and np.mean(lost) < 0.02
+    assert np.sum((fields.there & ~mask)[~lost]) <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_noise_that_nobody_stated_is_found(share):
+    """Sigma left out: the wrong points, and sigma0 of the others within a tenth of the truth on the average."""
+    photos, wrong = with_wrong_points(any_position(48, 50, seed=3), share, seed=3)
+    pairs = jaxro.pair(*photos, focal=FOCAL)
+    select = lambda r: (r.outcome == OUTCOMES.no_consensus, r.mask, r.orientation.sigma0)
+    lost, mask, sigma0 = map(np.asarray, jaxro.clean_batch(pairs, Recommended(known=False), select=select))
+    assert np.mean(lost) <= 0.03
+    assert 0.9 < np.median(sigma0[~lost]) / 0.01 < 1.1
+    assert np.mean(np.sum(mask & wrong, axis=1)[~lost]) < 0.4 and np.mean(np.sum(~mask & ~wrong, axis=1)[~lost]) < 0.4

@@ -7,11 +7,11 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..batch import decided, stages
+from ..batch import decided_in_stages
 from ..padding import FEWER
 from ..pairs import Pair
 from ..programs import Program
-from ..slabs import Report, Way, chunked, spread, unheard
+from ..slabs import Way, chunked, spread
 from .buckets import buckets
 from .colmap_cameras import PhotoPoints
 from .colmap_orientation import ENGINE, Found, Verdict, classified, verdict
@@ -62,22 +62,8 @@ def oriented(
 
 def _found(block: Block, points: PhotoPoints, size: int, sigma: float, told: Callable[[int], None]) -> Found:
     pairs = batch(block, points, size, sigma)
-    verdicts = engine_verdicts(pairs, lambda done, total: told(done))
+    verdicts = decided_in_stages(pairs, ENGINE, verdict, ONE_BY_ONE, lambda done, total: told(done))
     return spread((pairs, verdicts), Program(_all_classified, {}), ONE_BY_ONE, 1)
-
-
-def engine_verdicts(pairs: Pair, report: Report = unheard) -> Verdict:
-    """What the engine says of every pair: the stages in turn, each on the pairs that the one before left open."""
-    first, *others = stages(ENGINE, pairs.x_left.shape[-1])
-    found, again = decided(pairs, first, verdict, ONE_BY_ONE, report)
-    for stage in others:
-        rest = np.flatnonzero(again)
-        if rest.size:
-            left_over = jax.tree.map(lambda a, rest=rest: a[rest], pairs)
-            new = decided(left_over, stage, verdict, ONE_BY_ONE, unheard)
-            for target, source in zip(jax.tree.leaves((found, again)), jax.tree.leaves(new), strict=True):
-                target[rest] = source
-    return found
 
 
 def _all_classified(verdicts: tuple[Pair, Verdict]) -> Found:

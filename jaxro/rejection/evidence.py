@@ -53,8 +53,10 @@ def shifted_agreement(pair: Pair, pose: RelativePose, limit: ArrayLike) -> tuple
 
 
 def scattered(squares: Values, out: Use, limit: Float[Array, ""]) -> Float[Array, ""]:
-    """The chance of agreement if points agreed as seldom as those that are out are far: limit / mean |r| / sigma, twice
-    that of points spread evenly up to twice their mean, as near ones are the more frequent ones."""
+    """The chance that a wrong point agrees, from how far those lie that are out: limit / (mean |r| / sigma).
+
+    It is twice that of points spread evenly up to twice their mean distance, since small distances are more frequent.
+    """
     mean = total(jnp.where(out, jnp.sqrt(squares), 0.0)) / jnp.maximum(count(out), 1.0)
     return limit / jnp.maximum(mean, 2 * limit)
 
@@ -75,7 +77,8 @@ def accidents(chance: Float[Array, ""], of: Float[Array, ""], kept: Float[Array,
 def least_accidents(
     squares: Values, use: Use, chance: Float[Array, ""], of: Float[Array, ""], limit: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """The same of the nearest k of the points in use, for the k of which it is least: `squares` = (r / sigma)².
+    """Logarithm of the expected number of accidents of the nearest k of the points in use, for the k for which it is
+    least; `squares` = (r / sigma)².
 
     Another point is as near as the k-th of them with a probability that is proportional to its distance, and is
     `chance` within the limit (Moisan and Stival 2004). So right points that lie well within the limit are the stronger

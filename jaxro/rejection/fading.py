@@ -53,8 +53,7 @@ def faded(pair: Pair, pose: RelativePose, use: Use) -> Pair:
 
 
 def _factors(pair: Pair, pose: RelativePose, use: Use) -> Float[Array, "point"]:
-    """By how much the standard deviations grow that have the weights of a solution with fading weights."""
-
+    """The factors of the standard deviations by which they have the weights of a solution with fading weights."""
     s = squares(pair, pose)
     mean = total(jnp.where(use, s, 0.0)) / jnp.maximum(count(use), 1.0)
     noise = lax.fori_loop(0, ESTIMATES, lambda _, square: _core(s, use, square), mean)

@@ -38,6 +38,7 @@ from .stages import (
     Use,
     believed_if_it_fits,
     from_vertical,
+    on_a_plane,
     rescaled,
     settled,
 )
@@ -46,6 +47,9 @@ from .undecided import undecided
 
 UNKNOWN = 3000.0
 """Where nothing is said of the noise, a search begins with this part of the focal length."""
+
+LEAST = 0.4
+"""Share of the points below which a set of them is not believed without a search."""
 
 
 class Plain(AbstractStage):
@@ -60,16 +64,22 @@ class Plain(AbstractStage):
 
 
 class Quick(AbstractStage):
-    """The graduated search. Believed if at least `share` of the points are kept, these pass the global test, and sets
-    as good are not expected by accident more than `accidents` times."""
+    """The graduated search. Believed if at least `share` of the points are kept, or `many`, these pass the global test,
+    and sets as good are not expected by accident more than `accidents` times. A part of a regular field of targets may
+    fit a wrong pose, but it is small; and a plane has two poses, which are to be compared."""
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
-    share: float = 0.4
+    share: float = 0.6
+    many: int = 60
     accidents: float = 1e-4
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         decision = settled(pair, self.graduated.search(pair), limit)
-        return believed_if_it_fits(pair, *decision, limit, self.share, self.accidents)
+        decision = believed_if_it_fits(pair, *decision, limit, LEAST, self.accidents)
+        kept = count(decision.use)
+        enough = (kept >= self.share * count(pair.mask)) | (kept >= self.many)
+        _, _, alone = on_a_plane(pair, decision.pose, decision.use, limit)
+        return decision._replace(believed=decision.believed & enough & ~alone)
 
 
 class Recommended(AbstractProcedure):

@@ -31,7 +31,7 @@ from ..programs import while_loop
 from ..reductions import count, total
 from . import five_points
 from .hypotheses import moved_up, squares, subsets
-from .robust import stepped
+from .robust import seen, stepped
 
 LUCK = 2.0
 """Subsets of right points alone for one that leads to the right orientation: others are weak, or lose their root."""
@@ -268,6 +268,7 @@ def moved_up_sigma(pair: Pair) -> Float[Array, "point"]:
 
 
 def score(pair: Pair, pose: RelativePose, limit: float) -> Float[Array, ""]:
-    """Σ min((r / sigma)², limit²), infinite where it is no number."""
-    value = total(jnp.minimum(squares(pair, pose), limit**2))
+    """Σ min((r / sigma)², limit²), limit² for what cannot be seen from there, infinite where it is no number."""
+    agreed = jnp.minimum(squares(pair, pose), limit**2)
+    value = total(jnp.where(pair.mask & ~seen(pair, pose, limit), limit**2, agreed))
     return jnp.where(jnp.isfinite(value), value, jnp.inf)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .. import planes
 from ..elements import RelativePose, vertical
 from ..pairs import Pair
 from ..reductions import count, total
@@ -24,6 +25,12 @@ ROUNDS = 10
 
 FEW = 7
 """Points out up to which they are also judged one by one, beginning with all of them."""
+
+NEARLY_ALL = 0.75
+"""Share of the points above which those that are out are the exceptions, of whatever size their errors are."""
+
+FLAT = 0.6
+"""Share of the points kept from which on their plane alone may have chosen between its two poses."""
 
 DEVIATIONS = 3.0
 """The level of the global test, as multiple of a standard deviation of a normal number."""
@@ -67,16 +74,27 @@ def believed_if_it_fits(
 
     Points that agree with a wrong pose, as those of one depth do, lie about it as far as the limit reaches, and fail
     the global test. If they pass it by far, sigma is too large for it to tell that. Others agree by chance with a
-    probability of about limit / mean |r|.
+    probability of about limit / mean |r|, which is much where errors are small: nearly all points need no such proof.
     """
     n, k = count(pair.mask), count(use)
     s = squares(pair, pose)
     misfit = total(jnp.where(use, s, 0.0))
     low, high = (evidence.chi_squared_limit(d, k - 5) for d in (-DEVIATIONS, DEVIATIONS))
     fits = (misfit >= low) & (misfit <= high) & (k >= share * n) & (k > 5)
+    nearly_all = k > NEARLY_ALL * n
     out = pair.mask & ~use
     certain = evidence.accidents(evidence.scattered(s, out, limit), n, k) <= math.log(accidents)
-    return Decision(pose, use, fits & (certain | (count(out) == 0)), jnp.ones_like(limit))
+    return Decision(pose, use, fits & (certain | nearly_all), jnp.ones_like(limit))
+
+
+def on_a_plane(
+    pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]
+) -> tuple[RelativePose, planes.Plane, Bool[Array, ""]]:
+    """The pose turned so that the points are in front, the plane of the points in use, and whether it alone may have
+    chosen between its two poses: most of these lie in it, and the points that are out may be good ones beside it."""
+    facing = planes.facing(pair.with_mask(use), pose)
+    plane = planes.plane(pair, facing, use, limit)
+    return facing, plane, (plane.share >= FLAT) & (count(pair.mask & ~use) > 0)
 
 
 def rescaled(pair: Pair, scale: Float[Array, ""]) -> Pair:

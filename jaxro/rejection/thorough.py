@@ -5,12 +5,13 @@ import math
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from .. import planes
 from ..elements import RelativePose
 from ..pairs import Pair, cleaned
-from ..programs import while_loop
-from ..reductions import count
+from ..programs import if_needed, while_loop
+from ..reductions import count, total
 from . import evidence
 from .graduated_non_convexity import GraduatedNonConvexity
 from .hypotheses import Newton, squares
@@ -18,7 +19,17 @@ from .noise import noise_of
 from .ransac import Ransac
 from .robust import reweighted
 from .search import Found, Search, score
-from .stages import DEVIATIONS, AbstractStage, Decision, Use, believed_if_it_fits, from_vertical, rescaled, settled
+from .stages import (
+    DEVIATIONS,
+    AbstractStage,
+    Decision,
+    Use,
+    believed_if_it_fits,
+    from_vertical,
+    on_a_plane,
+    rescaled,
+    settled,
+)
 
 OVERWHELMING = math.log(1e-9)
 """Logarithm of an expected number of accidents at which a search that came to its end is believed in any case."""
@@ -32,6 +43,9 @@ APART = 0.6
 MAJORITY = 0.4
 """Part of the points that agreed before that the noise has to be that of: a few points may agree by accident."""
 
+SURE = 30.0
+"""Redundancy of the noise found from which it may contradict the sigma stated: of fewer points some fit by accident."""
+
 NARROWER, NARROWINGS = 0.7, 12
 """By how much the limit narrows in two steps, and how many steps: down to an eighth."""
 
@@ -44,12 +58,13 @@ class Thorough(AbstractStage):
     found.
 
     It begins with the best of all points from the vertical, the graduated search, and for at most `few` points many
-    subsets solved from the vertical: of few points that finds what a search in any position takes long for. If that
-    fits as `Quick` asks, with `accidents_at_once`, it is believed at once. Otherwise it is believed if the subsets were
-    enough to have met a set of `better` times as many points, and sets as good are not expected by accident more than
-    `accidents` times, by the chance of agreement that partners shifted among the points and the orientations that lost
-    have on this scene. Points that repeat others count once. The search ends when no set that it could still find would
-    be believed, after at least `least` subsets, so that the pose is as good as it can be where nothing is believed.
+    subsets solved from the vertical: of few points that finds what a search in any position takes long for. What is
+    found is believed if it fits as `Quick` asks, with `accidents_at_once`; or if the subsets were enough to have met a
+    set of `better` times as many points, and sets as good are not expected by accident more than `accidents` times, by
+    the chance of agreement that partners shifted among the points and the orientations that lost have on this scene.
+    Points that repeat others count once. Of a plane with other points beside it both poses are compared. The search
+    ends when no set that it could still find would be believed, after at least `least` subsets, so that the pose is as
+    good as it can be where nothing is believed.
 
     Where the residuals leave no doubt that sigma is much too large, the search begins again with the noise that they
     show, by which the points are then judged, too; where sigma is not `known` they always are.
@@ -69,26 +84,21 @@ class Thorough(AbstractStage):
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         again, key = evidence.repeats(pair)
         once = cleaned(pair.with_mask(pair.mask & ~again))[0]
-        first = self._near_vertical(once)
-        at_once = believed_if_it_fits(once, *settled(once, first, limit), limit, self.share, self.accidents_at_once)
-        at_once = at_once._replace(believed=at_once.believed & self.known)
-
-        found, scale = self._searched(once, first, ~at_once.believed, limit)
+        found, scale = self._searched(once, self._near_vertical(once), limit)
         once = rescaled(once, scale)
-        pose, use = settled(once, found.pose, limit)
+        pose, use = _of_both_poses(once, *settled(once, found.pose, limit), limit)
+
         chance = jnp.maximum(_chance(once, pose, use, limit), found.agreed / jnp.maximum(found.asked, 1.0))
         of = count(once.mask)
         expected = evidence.least_accidents(squares(once, pose), use, chance, of, limit)
         enough = self.search.enough_for(jnp.minimum(self.better * count(use), of), of)
         thorough = (found.counted >= enough) | (expected <= OVERWHELMING)
-        later = Decision(pose, use, (expected <= math.log(self.accidents)) & thorough, scale)
-        decision = jax.tree.map(lambda a, b: jnp.where(at_once.believed, a, b), at_once, later)
-        return decision._replace(use=evidence.with_repeats(decision.use, again, key))
+        certain = (expected <= math.log(self.accidents)) & thorough
+        at_once = believed_if_it_fits(once, pose, use, limit, self.share, self.accidents_at_once).believed & self.known
+        return Decision(pose, evidence.with_repeats(use, again, key), certain | at_once, scale)
 
-    def _searched(
-        self, pair: Pair, first: RelativePose, wanted: Bool[Array, ""], limit: Float[Array, ""]
-    ) -> tuple[Found, Float[Array, ""]]:
-        """The search from a first pose, where it is wanted, and the noise to judge by, as a multiple of that stated."""
+    def _searched(self, pair: Pair, first: RelativePose, limit: Float[Array, ""]) -> tuple[Found, Float[Array, ""]]:
+        """The search from a first pose, and the noise to judge by, as a multiple of that stated."""
 
         def turn(state):
             k, _, scale, found = state
@@ -97,15 +107,17 @@ class Thorough(AbstractStage):
             narrowed = _narrowed(own, found.pose, self.search.limit)
             noise = noise_of(squares(pair, narrowed), pair.mask)
             upper = noise.sigma * (1 + DEVIATIONS / jnp.sqrt(2 * jnp.maximum(noise.redundancy, 0.5)))
-            most = noise.redundancy >= MAJORITY * count(squares(own, found.pose) <= self.search.limit**2)
-            taken = noise.known & most & ((upper < APART * scale) | (not self.known))
+            agreed = count(squares(own, found.pose) <= self.search.limit**2)
+            of_most = noise.redundancy >= MAJORITY * agreed
+            too_large = (upper < APART * scale) & (noise.redundancy >= SURE)
+            taken = noise.known & of_most & (too_large | (not self.known))
             new = jnp.where(taken, jnp.clip(noise.sigma, 1 / MOST, MOST), scale)
             apart = (new < APART * scale) | (scale < APART * new)
             pose = jax.tree.map(lambda a, b: jnp.where(apart, a, b), narrowed, found.pose)
             return k + 1, apart, new, found._replace(pose=pose)
 
         one = jnp.ones_like(limit)
-        start = jnp.zeros((), int), wanted, one, self.search.begin(pair, first)
+        start = jnp.zeros((), int), count(pair.mask) > 0, one, self.search.begin(pair, first)
         _, _, scale, found = while_loop(lambda state: state[1] & (state[0] < TURNS), turn, start, pair.focal_left)
         return found, scale
 
@@ -131,6 +143,23 @@ def _chance(pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]) -
     agreed, asked = evidence.shifted_agreement(pair, pose, limit)
     spread = evidence.scattered(squares(pair, pose), pair.mask & ~use, limit) / 2
     return jnp.maximum((agreed + 1) / (asked + 2), spread)
+
+
+def _of_both_poses(pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]) -> tuple[RelativePose, Use]:
+    """Where the points in use are those of a plane, and others are out, the one of its two poses that costs less."""
+    facing, plane, alone = on_a_plane(pair, pose, use, limit)
+
+    def cost(pose, use):
+        return total(jnp.where(pair.mask, jnp.where(use, squares(pair, pose), limit**2), 0.0))
+
+    def chosen(needed):
+        own = pair.with_mask(pair.mask & needed)
+        other, exists = planes.second(own.with_mask(plane.within & needed), facing, plane.normal)
+        other, others = settled(own, other, limit)
+        better = exists & (cost(other, others) < cost(pose, use))
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), (other, others), (pose, use))
+
+    return if_needed(alone, chosen, (pose, use))
 
 
 def _narrowed(pair: Pair, pose: RelativePose, limit: float) -> RelativePose:
