@@ -175,9 +175,13 @@ def noise(
 
 
 def required(freedom: Float[Array, ""]) -> Float[Array, ""]:
-    """Multiple of sigma0 below which a `margin` is not told from measuring errors: 4, and more where sigma0 itself is
-    uncertain, having few degrees of freedom (64 with one)."""
-    return 4 + 60 / jnp.maximum(freedom, 1.0)
+    """Multiple of sigma0 below which a `margin` is not told from measuring errors: 2, and more where sigma0 itself is
+    uncertain, having few degrees of freedom (64 with one).
+
+    The errors alone give points that determine nothing a margin of 1. Of 150 points with margins of 2 to 3 the 95 %
+    regions hold 93 % of the poses, as those with any larger margin do; with 1.6 to 2 they hold 89 %, with 1.3 80 %.
+    """
+    return 2 + 62 / jnp.maximum(freedom, 1.0)
 
 
 def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:
