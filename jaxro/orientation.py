@@ -236,20 +236,21 @@ def _inspected(
     chosen, q = chosen_elements.chosen(solved, adjustment.cofactor, flipped, elements, length)
 
     unit = pose.bx, pose.by, pose.bz
-    q_of, meet = coplanarity.parallax_of(pair, pose), model_point(pair, pose, chosen, elements.scale(unit, length))
-    of_point = lambda point, use: (jnp.where(use, q_of(point), 0.0), *meet(point, use))
-    parallax, model, in_front, behind = pointwise(of_point, pair.coordinates, pair.mask)
-
     freedom = adjustment.degrees_of_freedom
-    checked = freedom > 0
+    checked, free = freedom > 0, freedom.astype(adjustment.sigma0.dtype)
+    estimated = jnp.where(checked, adjustment.sigma0, 0.0)
+    noise = degeneracy.noise(estimated, free, inspected.sigma, pair.focal_left)
+
+    q_of = coplanarity.parallax_of(pair, pose)
+    meet = model_point(pair, pose, chosen, elements.scale(unit, length), noise.size)
+    of_point = lambda point, sigma, use: (jnp.where(use, q_of(point), 0.0), *meet(point, sigma, use))
+    parallax, model, in_front, behind = pointwise(of_point, pair.coordinates, pair.sigma, pair.mask)
+
     qq, behind = sums((parallax**2, (behind & ~pair.coarse).astype(parallax.dtype)))
     m_q = jnp.where(checked, root(qq / jnp.where(checked, freedom, 1).astype(parallax.dtype)), jnp.nan)
 
     result = adjustment.result
     fair = result == RESULTS.successful
-    free = freedom.astype(adjustment.sigma0.dtype)
-    estimated = jnp.where(checked, adjustment.sigma0, 0.0)
-    noise = degeneracy.noise(estimated, free, inspected.sigma, pair.focal_left)
     worst, worst_chosen = (
         jnp.max(jnp.diagonal(degeneracy.in_radians(of, cofactor)[0]))
         for of, cofactor in ((solved, adjustment.cofactor), (chosen, q))

@@ -23,8 +23,8 @@ SHIFTS, TRIALS = 8, 4096
 """Other partners that each point is given: at least so many, more where there are few points, to make so many trials.
 """
 
-NEAREST = 0.1
-"""Part of the limit below which no point is nearer by more than accident."""
+PARTS = [2 ** (-k / 4) for k in range(14)]
+"""Of the limit, down to a tenth, within which points are counted: below it none is nearer by more than accident."""
 
 
 def chi_squared_limit(deviations: float, freedom: Float[Array, ""]) -> Float[Array, ""]:
@@ -75,23 +75,24 @@ def accidents(chance: Float[Array, ""], of: Float[Array, ""], kept: Float[Array,
 
 
 def least_accidents(
-    squares: Values, use: Use, chance: Float[Array, ""], of: Float[Array, ""], limit: Float[Array, ""]
+    squares: Values, use: Use, chance: Float[Array, ""], of: Float[Array, ""], limit: Float[Array, ""] | float
 ) -> Float[Array, ""]:
-    """Logarithm of the expected number of accidents of the nearest k of the points in use, for the k for which it is
-    least; `squares` = (r / sigma)².
+    """Logarithm of the expected number of accidents of the points within a part of the limit, for the part for which it
+    is least; `squares` = (r / sigma)².
 
-    Another point is as near as the k-th of them with a probability that is proportional to its distance, and is
-    `chance` within the limit (Moisan and Stival 2004). So right points that lie well within the limit are the stronger
-    evidence for it, and sigma need not be known well.
+    Another point lies within a part of the limit with that part of the `chance` that it lies within the limit (Moisan
+    and Stival 2004). So right points that lie well within it are the stronger evidence for it, and sigma need not be
+    known well.
     """
-    nearest = jnp.sort(jnp.where(use, squares, jnp.inf))
-    kept = jnp.arange(1, nearest.shape[0] + 1, dtype=nearest.dtype)
-    part = jnp.clip(jnp.sqrt(nearest) / limit, NEAREST, 1.0)
-    each = jax.vmap(lambda part, k: accidents(chance * part, of, k))(part, kept)
-    return jnp.min(jnp.where(nearest <= limit**2, each, jnp.inf))
+
+    def within(part):
+        kept = count(use & (squares <= (part * limit) ** 2))
+        return accidents(chance * part, of, kept)
+
+    return jnp.min(jax.vmap(within)(jnp.asarray(PARTS, squares.dtype)))
 
 
-def fewest(chance: Float[Array, ""], of: Float[Array, ""], most: float, size: int) -> Float[Array, ""]:
+def fewest(chance: Float[Array, ""], of: Float[Array, ""], most: Float[Array, ""], size: int) -> Float[Array, ""]:
     """The fewest points that are no accident: whose expected number of sets as good is at most exp(`most`), if they lie
     within half of the limit."""
     kept = jnp.arange(6, size + 6, dtype=of.dtype)

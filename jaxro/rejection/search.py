@@ -2,12 +2,14 @@
 
 Random subsets of five points are solved; each of their orientations is scored by the truncated cost
 
-    Σ min((r / sigma)², limit²)
+    Σ log(1 + min((r / sigma)², limit²) / FINE²),
 
-(MSAC, Torr and Zisserman 2000), first on some of the points, the `judges`, the best on all. The best of each block of
-subsets is improved on the points near it (Chum, Matas and Kittler 2003) and replaces the best so far if it costs less.
-The search ends when a better orientation, of a larger share p of the points, would have been met with the probability
-`confidence`: after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
+first on some of the points, the `judges`, the best on all. Half of |r| lowers it by the same amount for every point
+within the limit, down to FINE. So it tells the right orientation also where sigma is several times too large and more
+points agree with another one, where a cost that grows with r² (MSAC, Torr and Zisserman 2000) does not. The best of
+each block of subsets is improved on the points near it (Chum, Matas and Kittler 2003) and replaces the best so far if
+it costs less. The search ends when a better orientation, of a larger share p of the points, would have been met with
+the probability `confidence`: after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
 
 Right matches that lie near each other in one photo lie near each other in the other one. Every second block therefore
 draws from the points whose neighbours agree best. This changes only the order in which orientations are met: the score
@@ -41,6 +43,9 @@ PER_SUBSET = 2
 
 GUIDED = 24
 """Blocks of which every second one is drawn from the points whose neighbours agree."""
+
+FINE = 0.25
+"""Multiple of sigma within which points are about equally near."""
 
 FRONTS = 5
 """Halvings of the points to those whose neighbours agree best."""
@@ -228,11 +233,11 @@ def _judged(pair: Pair, rows, of, poses: RelativePose, judges: int, limit: float
 
     each = jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, 0))
     r2 = each(f, tuple(points[:, k] for k in range(4)), there[:, 0] > 0)
-    share = jnp.minimum(r2 / bound, 1.0)
+    costs = cost(r2 / bound * limit**2, limit)
     agree = jnp.where(r2 <= bound, there, 0.0)
     double = lambda a: a.astype(pair.focal_left.dtype)
-    asked = jnp.broadcast_to(jnp.sum(there), share.shape[1:])
-    return Judgement(*map(double, (jnp.sum(share * there, axis=0), jnp.sum(agree, axis=0), asked)))
+    asked = jnp.broadcast_to(jnp.sum(there), costs.shape[1:])
+    return Judgement(*map(double, (jnp.sum(costs * there, axis=0), jnp.sum(agree, axis=0), asked)))
 
 
 def neighbourly(rows: Float[Array, "point 4"], of: Float[Array, ""]) -> Int[Array, "point"]:
@@ -268,7 +273,12 @@ def moved_up_sigma(pair: Pair) -> Float[Array, "point"]:
 
 
 def score(pair: Pair, pose: RelativePose, limit: float) -> Float[Array, ""]:
-    """Σ min((r / sigma)², limit²), limit² for what cannot be seen from there, infinite where it is no number."""
-    agreed = jnp.minimum(squares(pair, pose), limit**2)
-    value = total(jnp.where(pair.mask & ~seen(pair, pose, limit), limit**2, agreed))
+    """The cost of all points, the most of one that cannot be seen from there; infinite where it is no number."""
+    found = jnp.where(seen(pair, pose, limit), squares(pair, pose), limit**2)
+    value = total(jnp.where(pair.mask, cost(found, limit), 0.0))
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
+
+
+def cost(square: Float[Array, "*points"], limit: float) -> Float[Array, "*points"]:
+    """log(1 + min((r / sigma)², limit²) / FINE²) of (r / sigma)²."""
+    return jnp.log1p(jnp.minimum(square, limit**2) / FINE**2)

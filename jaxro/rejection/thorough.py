@@ -34,6 +34,10 @@ from .stages import (
 OVERWHELMING = math.log(1e-9)
 """Logarithm of an expected number of accidents at which a search that came to its end is believed in any case."""
 
+PLENTY = 64.0
+"""Points up to which `accidents` are judged as they are; of more its power by their number over this one: groups of
+repeated structure, which agree with many orientations, are the larger the more points there are."""
+
 TURNS = 2
 """Searches, the second one with the noise that the first one found."""
 
@@ -60,11 +64,11 @@ class Thorough(AbstractStage):
     It begins with the best of all points from the vertical, the graduated search, and for at most `few` points many
     subsets solved from the vertical: of few points that finds what a search in any position takes long for. What is
     found is believed if it fits as `Quick` asks, with `accidents_at_once`; or if the subsets were enough to have met a
-    set of `better` times as many points, and sets as good are not expected by accident more than `accidents` times, by
-    the chance of agreement that partners shifted among the points and the orientations that lost have on this scene.
-    Points that repeat others count once. Of a plane with other points beside it both poses are compared. The search
-    ends when no set that it could still find would be believed, after at least `least` subsets, so that the pose is as
-    good as it can be where nothing is believed.
+    set of `better` times as many points, and sets as good are not expected by accident more than `accidents` times (of
+    many points more seldom), by the chance of agreement that partners shifted among the points and the orientations
+    that lost have on this scene. Points that repeat others count once. Of a plane with other points beside it both
+    poses are compared. The search ends when no set that it could still find would be believed, after at least `least`
+    subsets, so that the pose is as good as it can be where nothing is believed.
 
     Where the residuals leave no doubt that sigma is much too large, the search begins again with the noise that they
     show, by which the points are then judged, too; where sigma is not `known` they always are.
@@ -93,7 +97,7 @@ class Thorough(AbstractStage):
         expected = evidence.least_accidents(squares(once, pose), use, chance, of, limit)
         enough = self.search.enough_for(jnp.minimum(self.better * count(use), of), of)
         thorough = (found.counted >= enough) | (expected <= OVERWHELMING)
-        certain = (expected <= math.log(self.accidents)) & thorough
+        certain = (expected <= self._most(of)) & thorough
         at_once = believed_if_it_fits(once, pose, use, limit, self.share, self.accidents_at_once).believed & self.known
         return Decision(pose, evidence.with_repeats(use, again, key), certain | at_once, scale)
 
@@ -125,8 +129,12 @@ class Thorough(AbstractStage):
         """How many subsets are worth it: enough to meet the smallest set that would be believed."""
         of = count(pair.mask)
         use = pair.mask & (squares(pair, pose) <= limit**2)
-        fewest = evidence.fewest(_chance(pair, pose, use, limit), of, math.log(self.accidents), pair.mask.shape[0])
+        fewest = evidence.fewest(_chance(pair, pose, use, limit), of, self._most(of), pair.mask.shape[0])
         return jnp.maximum(self.search.enough_for(fewest, of), float(self.least))
+
+    def _most(self, of: Float[Array, ""]) -> Float[Array, ""]:
+        """Logarithm of the expected number of accidents up to which a set of so many points is believed."""
+        return math.log(self.accidents) * jnp.maximum(of / PLENTY, 1.0)
 
     def _near_vertical(self, pair: Pair) -> RelativePose:
         """The best orientation of those that begin at the vertical."""
