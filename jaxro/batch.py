@@ -28,7 +28,7 @@ from .starts import AbstractStart, Auto
 CHUNK_POINTS = 16384
 """Points per chunk: a working set of a few hundred kB, which stays in the cache of one core."""
 
-SUBSETS = 512
+SUBSETS = 256
 """Random subsets that are solved together."""
 
 ALONE = 1 << 15
