@@ -17,7 +17,7 @@ A pair without enough evidence for its pose takes no part.
 
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -87,7 +87,7 @@ def estimate(pairs: Pair | Ragged | Iterable[Pair]) -> TableNoise:
     asked = 0 if chosen is None else len(chosen.x_left)
     if chosen is None:
         raise ValueError("no pair has six points or more, which would show the noise: state the standard deviation")
-    unit = float(np.median(_focal_in_sigma(chosen)))  # a start is one for all pairs
+    unit = float(np.median(_focal_in_sigma(jax.device_put(chosen))))  # a start is one for all pairs
     blocks = -(-asked // BLOCK)
     size = asked // blocks
     parts = [jax.tree.map(lambda a, k=k: a[k::blocks][:size], chosen) for k in range(blocks)]
@@ -145,7 +145,7 @@ def _settled(parts: list[Pair], first: float) -> tuple[Noise, Bool[np.ndarray, "
     begin = first
     for _ in range(STEPS):
         each = [_from(pairs, begin) for pairs in parts]
-        found = jax.tree.map(lambda *a: np.concatenate(a), *each)
+        found = jax.tree.map(lambda *a: jnp.concatenate(a), *each)
         evidence = np.asarray(_evidence_of_all(found, jnp.asarray([begin])))[0]
         part = np.asarray(found.noise.known) & (evidence > EVIDENCE)
         if not part.any():
@@ -160,7 +160,7 @@ def _settled(parts: list[Pair], first: float) -> tuple[Noise, Bool[np.ndarray, "
 
 def _together(noises: Noise, part: Bool[np.ndarray, " pair"]) -> Noise:
     """The noise of these pairs; of a single one its own, which is above the truth as often as below."""
-    chosen = jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[part]), noises)
+    chosen = jax.tree.map(lambda a: a[part], noises)
     return pooled(chosen) if part.sum() > 1 else jax.tree.map(lambda a: a[0], chosen)
 
 
@@ -182,7 +182,7 @@ def _evidence_of_all(found: _Read, trials: Float[Array, "trial"]) -> Float[Array
     return jax.lax.map(lambda s: jax.vmap(lambda one: _evidence(one, s))(found), trials)
 
 
-def _focal_in_sigma(pairs: Pair) -> Any:
+def _focal_in_sigma(pairs: Pair) -> Float[Array, "*pairs"]:
     """The focal length over the mean standard deviation of a coordinate."""
     n = jnp.maximum(count(pairs.mask), 1.0)
     return pairs.focal_left * n / jnp.maximum(total(jnp.where(pairs.mask, pairs.sigma, 0.0)), 1e-300)
