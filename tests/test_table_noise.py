@@ -23,38 +23,39 @@ def measured(make, pairs: int, points: int, share: float, seed: int = 7):
     return jaxro.pair(*photos, focal=FOCAL), wrong
 
 
+def pose_of(rejection):
+    return rejection.orientation.pose
+
+
 def right(pairs, poses) -> float:
     """The share of the pairs that are oriented within 0.05° of these poses after cleaning."""
-    found = jaxro.clean_batch(pairs, Recommended(), select=lambda r: r.orientation.pose)
+    found = jaxro.clean_batch(pairs, Recommended(), select=pose_of)
     turns = [np.stack([np.asarray(a) for a in jax.tree.leaves(pose)[:4]]) for pose in (found, poses)]
     angle = 2 * np.arccos(np.minimum(np.abs(np.sum(turns[0] * turns[1], axis=0)), 1))
     return float(np.mean(angle < np.deg2rad(0.05)))
 
 
+@pytest.mark.parametrize("make", [aerial, any_position])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.5])
 @pytest.mark.parametrize(
-    ("points", "share"),
-    [(50, 0.0), (50, 0.5)]
-    + [
-        pytest.param(points, share, marks=pytest.mark.slow)
-        for points, share in [(16, 0.0), (16, 0.3), (16, 0.5), (50, 0.3), (200, 0.0), (200, 0.3), (200, 0.5)]
-    ],
+    ("pairs", "points", "within"),
+    [(12, 50, 0.15), *(pytest.param(64, points, 0.1, marks=pytest.mark.slow) for points in (16, 50, 200))],
 )
-def test_the_table_tells_its_noise_and_is_cleaned_as_well_with_it(points, share):
-    """Within a tenth of the truth, and no fewer right orientations than with the true sigma."""
-    for make in (aerial, any_position):
-        pairs, wrong = measured(make, 64, points, share)
-        noise = table_noise.estimate(pairs)
-        assert 0.9 < noise.sigma / SIGMA < 1.1, make
-        assert noise.deviation < 0.1 * SIGMA and noise.pairs > 0.8 * noise.asked
-        known = pairs.with_mask(~wrong)
-        poses = jaxro.orient_batch(known, select=lambda o: o.pose)
-        given = table_noise.TableNoise(SIGMA, 0.0, 0, 0).applied(pairs)
-        assert right(noise.applied(pairs), poses) >= right(given, poses) - 0.02
+def test_the_table_tells_its_noise_and_is_cleaned_as_well_with_it(make, share, pairs, points, within):
+    """Within a tenth of the truth, of a few pairs a little more, whose residuals scatter by 4 %; and no fewer right
+    orientations than with the true sigma."""
+    table, wrong = measured(make, pairs, points, share)
+    noise = table_noise.estimate(table)
+    assert abs(noise.sigma / SIGMA - 1) < within
+    assert noise.deviation < 0.1 * SIGMA and noise.pairs > 0.8 * noise.asked
+    poses = jaxro.orient_batch(table.with_mask(~wrong), select=lambda o: o.pose)
+    given = table_noise.TableNoise(SIGMA, 0.0, 0, 0).applied(table)
+    assert right(noise.applied(table), poses) >= right(given, poses) - 0.02
 
 
 def test_sigma_is_in_the_unit_of_the_coordinates_and_a_multiple_of_the_pair_s():
     """Another unit, or a stated sigma, changes the number accordingly; lists, ragged pairs and batches agree."""
-    pairs, _ = measured(any_position, 12, 20, 0.2)
+    pairs, _ = measured(any_position, 12, 50, 0.2)
     noise = table_noise.estimate(pairs)
     pixels = jaxro.pair(*(200 * np.asarray(c) for c in pairs.coordinates), focal=200 * FOCAL)
     np.testing.assert_allclose(table_noise.estimate(pixels).sigma, 200 * noise.sigma, rtol=1e-6)
@@ -70,7 +71,7 @@ def test_what_tells_no_noise_is_refused():
     with pytest.raises(ValueError, match=r"six points.* state the standard deviation"):
         table_noise.estimate(pairs)
     rng = np.random.default_rng(8)
-    strangers = jaxro.pair(*rng.uniform(-70, 70, (4, 12, 20)), focal=FOCAL)
+    strangers = jaxro.pair(*rng.uniform(-70, 70, (4, 12, 50)), focal=FOCAL)
     with pytest.raises(ValueError, match=r"agree with one pose; state the standard deviation"):
         table_noise.estimate(strangers)
 
@@ -95,7 +96,7 @@ def run(*arguments):
 def test_auto_on_the_command_line(tmp_path):
     """The number taken is told, stands in the summaries, and gives what it gives when it is stated; part by part the
     same, and after a run that was stopped."""
-    pairs, _ = measured(any_position, 12, 20, 0.2)
+    pairs, _ = measured(any_position, 12, 50, 0.2)
     noise = table_noise.estimate(pairs)
     table, cheap = written(tmp_path / "pairs.csv", pairs), ("--procedure", "three-sigma")
     outs = [tmp_path / name for name in ("auto", "stated", "parts")]
