@@ -5,7 +5,7 @@ Nothing has to be known beforehand. Of at most PAIRS pairs, evenly spread, and a
 1. Where to begin: `Recommended(known=False)` finds the poses of some pairs from each of many standard deviations, in
    steps of 2. At the poses found, a trial standard deviation s is worth the logarithm of
 
-       density of |r| = a 2/s phi(r/s) + (1 - a) / R,    R = a tenth of the focal length,
+       density of |r| = a 2/s phi(r/s) + (1 - a) / R,    R = f / 25,
 
    against that of wrong points alone, a fitted to each pair. Five points fit any pose, so that five count as wrong
    ones. The sum over the pairs chooses: of few points among many wrong ones a search finds noise of about the size
@@ -40,20 +40,22 @@ PAIRS, POINTS = 256, 128
 BLOCK, CHUNK = 64, 8
 """Pairs of a call, so that every call is the same program, and of a search."""
 
-STARTS = tuple(2.0**k / 3000 for k in range(3, -8, -1))
-"""Where to begin, as parts of the focal length: 0.4 mm to 0.4 µm of 150 mm."""
+STARTS = tuple(2.0**k / 3000 for k in range(1, -8, -1))
+"""Where to begin, as parts of the focal length: 0.1 mm to 0.4 µm of 150 mm."""
 
-PASSED = 6.0
+PASSED = 16.0
 """How far below the likeliest trial the starts end: searches that begin too small find nothing, and take longest."""
 
 FINENESS = 2
-"""Trial standard deviations to each start."""
+"""Trial standard deviations to each start, from twice the first on."""
 
-FIELD = 0.1
-"""Distances of wrong points, as part of the focal length, are spread over this."""
+FIELD = 0.04
+"""Over what part of the focal length the distances of wrong points are spread: 6 mm of 150. Taken too wide, wrong
+points near the right ones look like noise."""
 
-EVIDENCE = 6.0
-"""Logarithm of the likelihood ratio from which a pair takes part."""
+EVIDENCE, TOGETHER = 3.0, 10.0
+"""Logarithm of the likelihood ratio from which a pair takes part, and by how much n pairs must exceed that on the
+average, times sqrt(n): of eight right points among sixteen a single pair tells nothing, twenty do."""
 
 STEPS, AGREES, DRIFTS = 4, 0.05, 2.0
 """How often the poses are found anew at most, the change of log sigma at which that ends, and the ratio to where they
@@ -81,7 +83,7 @@ def estimate(pairs: Pair | Ragged | Iterable[Pair]) -> TableNoise:
     """The noise of pairs of one camera: a batch, `Ragged` pairs, single pairs in a list, or one pair.
 
     Different standard deviations within `pairs` stay in their ratios. Raises ValueError where no pair tells: fewer than
-    six points everywhere, or no pose that enough points agree with to be no accident.
+    six points everywhere, or too few points that agree with a pose to be no accident.
     """
     chosen = _sample(pairs)
     asked = 0 if chosen is None else len(chosen.x_left)
@@ -94,7 +96,7 @@ def estimate(pairs: Pair | Ragged | Iterable[Pair]) -> TableNoise:
     found, part = _settled(parts, _begin(parts[0], unit))
     if not part.any():
         raise ValueError(
-            "the residuals tell no noise: in no pair do enough points agree with one pose; state the standard deviation"
+            "the residuals tell no noise: not enough points agree with one pose of their pair; state the standard deviation"
         )
     noise = _together(found, part)
     return TableNoise(float(noise.sigma), float(noise.deviation), int(part.sum()), len(part))
@@ -128,7 +130,7 @@ def _from(pairs: Pair, start: float) -> _Read:
 
 def _begin(pairs: Pair, unit: float) -> float:
     """The trial standard deviation that all pairs together find likeliest, over all starts."""
-    trials = unit * STARTS[0] * 2.0 ** (-np.arange(FINENESS * len(STARTS)) / FINENESS)
+    trials = unit * STARTS[0] * 2.0 ** (1 - np.arange(FINENESS * (len(STARTS) + 1)) / FINENESS)
     best = -1.0, 0.0
     for start in STARTS:
         if unit * start < best[1] / PASSED:
@@ -148,6 +150,7 @@ def _settled(parts: list[Pair], first: float) -> tuple[Noise, Bool[np.ndarray, "
         found = jax.tree.map(lambda *a: jnp.concatenate(a), *each)
         evidence = np.asarray(_evidence_of_all(found, jnp.asarray([begin])))[0]
         part = np.asarray(found.noise.known) & (evidence > EVIDENCE)
+        part &= np.sum(np.where(part, evidence - EVIDENCE, 0.0)) > TOGETHER * math.sqrt(max(np.sum(part), 1))
         if not part.any():
             break
         before, begin = begin, float(_together(found.noise, part).sigma)

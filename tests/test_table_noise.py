@@ -72,7 +72,7 @@ def test_what_tells_no_noise_is_refused():
         table_noise.estimate(pairs)
     rng = np.random.default_rng(8)
     strangers = jaxro.pair(*rng.uniform(-70, 70, (4, 12, 50)), focal=FOCAL)
-    with pytest.raises(ValueError, match=r"agree with one pose; state the standard deviation"):
+    with pytest.raises(ValueError, match=r"agree with one pose of their pair; state the standard deviation"):
         table_noise.estimate(strangers)
 
 
