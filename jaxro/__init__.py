@@ -34,6 +34,7 @@ from . import (
     simulation as simulation,
     starts as starts,
     surveys as surveys,
+    table_noise as table_noise,
     variance_components as variance_components,
 )
 from .adjustment import Adjustment as Adjustment, adjust as adjust

@@ -95,6 +95,13 @@ def join(pairs: Sequence[Pair]) -> Ragged:
     )
 
 
+def joined(parts: Sequence[Ragged]) -> Ragged:
+    """The pairs of several `Ragged` one behind the other."""
+    ends = np.cumsum([0] + [part.begins[-1] for part in parts])
+    begins = np.concatenate([[0], *(part.begins[1:] + end for part, end in zip(parts, ends, strict=False))])
+    return Ragged(begins, *(np.concatenate(fields) for fields in zip(*(part[1:] for part in parts), strict=True)))
+
+
 def checked(pairs: Ragged) -> Ragged:
     """The pairs in double precision. Raises ValueError where there are none."""
     if len(pairs.begins) < 2:

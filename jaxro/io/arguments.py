@@ -67,11 +67,11 @@ PixelSize = Annotated[
 ]
 YDown = Annotated[bool, typer.Option("--y-down", help="y of the table counts downwards.")]
 Sigma = Annotated[
-    float | None,
+    str | None,
     typer.Option(
         help="Standard deviation of every coordinate before the adjustment, in the units of the table; "
-        "sigma0 is then a ratio to it.",
-        metavar="SD",
+        "sigma0 is then a ratio to it. auto: that of the residuals of the table, in spite of wrong points.",
+        metavar="SD|auto",
         show_default=False,
     ),
 ]

@@ -47,6 +47,12 @@ class Cameras:
             raise TableError(file, line, "pair", found, expected)
         return self.photos[known[0][0]], self.photos[known[0][1]]
 
+    def of_all(self, names: Any, file: str) -> tuple[Camera, Camera] | list[tuple[Camera, Camera]]:
+        """(left, right) that all pairs have, or those of each of the names, an Arrow array. Raises TableError."""
+        if self.left is not None and self.right is not None:
+            return self.left, self.right
+        return [self.of(str(name), file) for name in names.to_pylist()]
+
 
 def read(path: Path) -> Cameras:
     """The cameras of a TOML file. Raises TableError."""

@@ -14,7 +14,7 @@ from ..orientation import orient
 from ..pairs import Pair, stack
 from ..programs import QUICK, Program
 from ..rejection import PROCEDURES, AbstractProcedure
-from . import files, job as jobs, mock_example, verdict_report, verdicts as judged
+from . import files, job as jobs, mock_example, sigma, verdict_report, verdicts as judged
 from .buckets import each
 from .console import consoles, progress
 from .fields import TableError
@@ -49,8 +49,10 @@ def run(options: Options, name: str, changes: list[str]) -> bool:
     if options.out is not None:
         summary = job.summary(solved)
         heading = {"program": summary["program"], "file": summary["file"], "procedure": name}
+        heading |= sigma.entry(job.noise)
         texts = judged.texts(verdicts, job.units.photo, heading | {"tolerances": tolerances(procedure)})
         texts |= files.texts(solved, job.units, summary)
+    jobs.show_sigma(console, job)
     verdict_report.show(console, verdicts, name, job.units.photo)
     jobs.show(console, job, solved)
     jobs.write(job, texts)

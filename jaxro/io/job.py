@@ -13,7 +13,8 @@ from ..batch import orient_batch
 from ..elements import AbstractElements, DependentElements, IndependentElements, RelativePose
 from ..orientation import Orientation, orient
 from ..pairs import Camera, Pair
-from . import cameras as camera_files, example, files, reading, report, solutions, tables
+from ..table_noise import TableNoise
+from . import cameras as camera_files, example, files, reading, report, sigma as deviation, solutions, tables
 from .buckets import each
 from .console import consoles, progress
 from .fields import TableError
@@ -37,7 +38,7 @@ class Options:
     principal_point: tuple[float, float] | None = None
     pixel_size: float | None = None
     y_down: bool = False
-    sigma: float | None = None
+    sigma: deviation.Sigma = None
     elements: str | None = None
     base: float | None = None
     residual: str = "rigorous"
@@ -72,6 +73,7 @@ class Job:
     pairs: list[Pair]
     system: type[AbstractElements]
     units: Units
+    noise: TableNoise | None = None
 
     @property
     def keywords(self) -> dict[str, Any]:
@@ -113,6 +115,7 @@ class Job:
             "residual": self.options.residual,
             "base": self.options.base,
             "sigma": self.options.sigma,
+            **deviation.entry(self.noise),
             **({} if self.interval is None else {"confidence": self.interval.confidence}),
             "usable": sum(s.usable for s in solved),
             "failed": sum(not s.usable for s in solved),
@@ -129,11 +132,15 @@ def prepared(options: Options, otherwise: Example = MEASURED) -> Job:
     known = read_cameras(options, otherwise)
     cameras = [known.of(measured.name, table.file, measured.lines[0]) for measured in table.pairs]
     check_numbers(options, table.has_sigma, table.file, system)
-    pairs = [
-        camera_files.to_pair(measured, table.file, *both, options.sigma)
-        for measured, both in zip(table.pairs, cameras, strict=True)
-    ]
-    return Job(options, table, cameras, pairs, system, units_of(options, table.has_sigma, system))
+
+    def pairs_with(sigma: float | None) -> list[Pair]:
+        each = zip(table.pairs, cameras, strict=True)
+        return [camera_files.to_pair(measured, table.file, *both, sigma) for measured, both in each]
+
+    noise = deviation.from_residuals(pairs_with(1.0)) if options.sigma == deviation.AUTO else None
+    sigma = deviation.stated(options.sigma) if noise is None else noise.sigma
+    units = units_of(options, table.has_sigma, system)
+    return Job(replace(options, sigma=sigma), table, cameras, pairs_with(sigma), system, units, noise)
 
 
 def units_of(options: Options, has_sigma: bool, system: type[AbstractElements]) -> Units:
@@ -154,6 +161,7 @@ def run(options: Options) -> bool:
         oriented = orient_all(job, told)
     solved = solutions.solutions(job.table.pairs, job.cameras, oriented, job.units, job.interval)
     texts = {} if options.out is None else files.texts(solved, job.units, job.summary(solved))
+    show_sigma(console, job)
     show(console, job, solved)
     write(job, texts)
     tell(console, job, texts)
@@ -178,6 +186,14 @@ def tell(console: Console, job: Job, texts: dict[str, str]) -> None:
     """Where the files are."""
     if job.options.out is not None:
         console.print(f"Written to {job.options.out}: {', '.join(texts)}", markup=False)
+
+
+def show_sigma(console: Console, job: Job) -> None:
+    """The standard deviation that was taken, where it was not given."""
+    if job.noise is not None:
+        plain = all(camera.pixel_size == 1 for both in job.cameras for camera in both)
+        unit = job.units.photo if plain else "in the unit of the table"
+        console.print(deviation.sentence(job.noise, unit), markup=False)
 
 
 def show(console: Console, job: Job, solved: list[Solution]) -> None:
@@ -233,8 +249,7 @@ def check_numbers(options: Options, has_sigma: bool, file: str, system: type[Abs
     if options.sigma is not None:
         if has_sigma:
             raise TableError("--sigma", None, None, f"it beside the column sigma of {file}", "only one of the two")
-        if not (math.isfinite(options.sigma) and options.sigma > 0):
-            raise TableError("--sigma", None, None, repr(options.sigma), "a positive standard deviation")
+        deviation.stated(options.sigma)
     if options.base is not None:
         if system is RelativePose:
             expected = "--elements dependent or independent with it; the relative system has the base 1"

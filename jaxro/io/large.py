@@ -4,17 +4,20 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
 from .. import __version__
 from ..padding import planned
+from ..ragged import Ragged, joined
 from ..rejection import AbstractProcedure
-from . import files, job as jobs, parquet
+from ..table_noise import PAIRS
+from . import files, job as jobs, parquet, sigma as deviation
 from .cameras import Cameras, check_one_sigma
 from .console import consoles, progress
 from .conversion import converted
@@ -23,11 +26,14 @@ from .job import Options
 from .records import TABLES, Recorder
 from .report import table as terminal_table
 from .solutions import WARNED
-from .streaming import CONVERTED, JOURNAL, MODIFIED, PART_ROWS, Job, Work, here, parts
+from .streaming import CONVERTED, JOURNAL, MODIFIED, PART_ROWS, Job, Work, asked_before, here, parts
 from .tolerances import check_sigma, tolerances
 
 REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
 """What may be in a folder whose place the results take."""
+
+PLACES = 8
+"""Runs of pairs, from the begin to the end of a table, that tell its noise."""
 
 WORKED_ON = (*REPLACED, CONVERTED, *(str(Path(name).with_suffix(".partial")) for name in (JOURNAL, CONVERTED)))
 """What may be in the folder of a run that was stopped."""
@@ -137,24 +143,46 @@ def _planned(
     scan = table.scan()
     cameras = jobs.read_cameras(options, jobs.MEASURED)
     _check_cameras(cameras, scan, table, known)
+    noise = None
+    if options.sigma == deviation.AUTO:
+        before = deviation.from_entry(asked_before(folder)) if large.resume else None
+        noise = before or deviation.from_residuals(_sample(table, scan, cameras))
+    sigma = deviation.stated(options.sigma) if noise is None else noise.sigma
     pieces = parts(scan.begins, large.part_rows)
     keywords = {"elements": system, "base": options.base, "residual": jobs.RESIDUALS[options.residual]}
     order = tuple(name for name in TABLES if name in ("elements", *chosen))
     if procedure and "residuals" not in order:
         order = (*order[:1], "residuals", *order[1:])
+    request = _request(replace(options, sigma=sigma), order, procedure) | deviation.entry(noise)
     work = Work(
         source.absolute(),
         options.file,
         folder,
         planned(scan.lengths, len(pieces)),
         cameras,
-        options.sigma,
+        sigma,
         Recorder(system, order, known, procedure is not None),
         keywords,
         jobs.units_of(options, table.has_sigma, system),
         procedure[1] if procedure else None,
     )
-    return Job(work, pieces, options.out.resolve(), _request(options, order, procedure))
+    return Job(work, pieces, options.out.resolve(), request)
+
+
+def _sample(table: parquet.Source, scan: parquet.Scan, cameras: Cameras) -> Ragged:
+    """The pairs whose residuals tell sigma: all of a small table, else PLACES runs of them, evenly spread."""
+    count = len(scan.begins) - 1
+    run, places = (count, 1) if count <= PAIRS else (PAIRS // PLACES, PLACES)
+    firsts = np.linspace(0, count - run, places).astype(int)
+    return joined([_rows(table, scan.begins[first : first + run + 1], cameras) for first in firsts])
+
+
+def _rows(table: parquet.Source, begins: np.ndarray, cameras: Cameras) -> Ragged:
+    """Pairs of the table whose standard deviations are its unit."""
+    rows = table.rows(int(begins[0]), int(begins[-1]))
+    own = begins - begins[0]
+    names = parquet.names(rows, own[:-1], str(table.path))
+    return parquet.ragged(rows, own, cameras.of_all(names, str(table.path)), 1.0)
 
 
 def _check_cameras(cameras: Cameras, scan: parquet.Scan, table: parquet.Source, sigma: bool) -> None:
@@ -223,6 +251,9 @@ def show(console: Console, job: Job, summary: dict[str, Any], seconds: float) ->
     if doubles:
         named = ", ".join(doubles[:5]) + (", ..." if len(doubles) > 5 else "")
         console.print(f"[yellow]Mind:[/yellow] two points of one name in pairs {escape(named)}")
+    noise = deviation.from_entry(job.request)
+    if noise is not None:
+        console.print(deviation.sentence(noise, "in the unit of the table"), markup=False)
     pairs = "1 pair" if summary["pairs"] == 1 else f"{summary['pairs']:,} pairs"
     rate = f"{pairs}, {summary['rows']:,} points in {seconds:.1f} s"
     tables = ", ".join(name for name in (*job.work.recorder.tables, "cleaned") if (job.target / name).exists())

@@ -16,7 +16,7 @@ from ..experiments.compare_tables import tables
 from ..orientation import orient
 from ..pairs import Pair, pad
 from ..rejection import PROCEDURES
-from . import files, job as jobs
+from . import files, job as jobs, sigma as deviation
 from .cleaning import named
 from .console import consoles, progress
 from .fields import TableError
@@ -135,9 +135,8 @@ def _standard(options: Options) -> dict[str, Pair]:
     ):
         if value is not None:
             raise TableError(name, None, None, "it without FILE.csv", "the table that it belongs to")
-    sigma = SIGMA if options.sigma is None else options.sigma
-    if not (math.isfinite(sigma) and sigma > 0):
-        raise TableError("--sigma", None, None, repr(sigma), "a positive standard deviation")
+    given = deviation.stated(options.sigma)
+    sigma = SIGMA if given is None else given
     rows = simulation.mock_pair(simulation.row_layout())
     eight = pad(simulation.mock_pair(simulation.standard_layout(8)), rows.x_left.shape[0])
     named = (("eight rows, 16 points", rows), ("standard zones, 8 points", eight))

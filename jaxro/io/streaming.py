@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..padding import Plan
-from ..pairs import Camera
 from ..ragged import clean_ragged, orient_ragged
 from ..rejection import AbstractProcedure, Rejection
 from . import cameras as camera_files, parquet, records
@@ -84,7 +83,7 @@ class Worker:
         table = self._source.rows(int(part.begins[0]), int(part.begins[-1]))
         begins = part.begins - part.begins[0]
         names = parquet.names(table, begins[:-1], str(w.file))
-        pairs = parquet.ragged(table, begins, self._cameras(names), w.sigma)
+        pairs = parquet.ragged(table, begins, w.cameras.of_all(names, str(w.file)), w.sigma)
         how = {"plan": w.plan, "threads": self._threads}
         kept, outcomes, tables = None, None, {}
         if w.procedure is not None:
@@ -113,12 +112,6 @@ class Worker:
             "doubles": [str(name) for name in names.take(doubles[:WARNED]).to_pylist()],
             "files": self._written(part.number, tables),
         }
-
-    def _cameras(self, names: Any) -> tuple[Camera, Camera] | list[tuple[Camera, Camera]]:
-        known = self._work.cameras
-        if known.left is not None and known.right is not None:
-            return known.left, known.right
-        return [known.of(str(name), str(self._work.file)) for name in names.to_pylist()]
 
     def _elements(
         self, points: np.ndarray, names: Any, of_pair: dict[str, np.ndarray], outcomes: np.ndarray | None
@@ -279,6 +272,12 @@ def _whole_lines(path: Path) -> Iterator[dict[str, Any]]:
         if not isinstance(entry, dict):
             return
         yield entry
+
+
+def asked_before(folder: Path) -> dict[str, Any]:
+    """What the run in this folder was asked for; nothing where it has no journal."""
+    lines = _whole_lines(folder / JOURNAL) if (folder / JOURNAL).exists() else iter(())
+    return next(lines, {}).get("request", {})
 
 
 def parts(begins: np.ndarray, rows: int) -> list[Part]:
