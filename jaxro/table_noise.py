@@ -33,6 +33,8 @@ from .reductions import count, sums, total
 from .rejection import Noise, Recommended, noise_of, pooled
 from .rejection.hypotheses import squares
 from .rejection.noise import PARAMETERS
+from .rejection.search import Search
+from .rejection.thorough import Thorough
 
 PAIRS, POINTS = 256, 128
 """Pairs that are looked at, at most, and points of each: a table of 16 points tells its noise to 1.5 % by then."""
@@ -60,6 +62,10 @@ average, times sqrt(n): of eight right points among sixteen a single pair tells 
 STEPS, AGREES, DRIFTS = 4, 0.05, 2.0
 """How often the poses are found anew at most, the change of log sigma at which that ends, and the ratio to where they
 began beyond which nothing is believed: noise that follows the search is none."""
+
+FINDER = Recommended(known=False, stages=(Thorough(search=Search(count=2048)),))
+"""Enough subsets for two thirds of wrong points. Pairs that need more can be left out; searches that begin far from the
+noise would go on to their end."""
 
 Pairs = TypeVar("Pairs", Pair, Ragged)
 
@@ -96,7 +102,8 @@ def estimate(pairs: Pair | Ragged | Iterable[Pair]) -> TableNoise:
     found, part = _settled(parts, _begin(parts[0], unit))
     if not part.any():
         raise ValueError(
-            "the residuals tell no noise: not enough points agree with one pose of their pair; state the standard deviation"
+            "the residuals tell no noise: not enough points agree with one pose of their pair; "
+            "state the standard deviation"
         )
     noise = _together(found, part)
     return TableNoise(float(noise.sigma), float(noise.deviation), int(part.sum()), len(part))
@@ -115,7 +122,7 @@ class _Read(NamedTuple):
 def _read(pair: Pair) -> _Read:
     """What the pose of a pair leaves, whose sigma is where the search begins."""
     pair = cleaned(pair)[0]
-    s = squares(pair, Recommended(known=False)(pair).orientation.pose)
+    s = squares(pair, FINDER(pair).orientation.pose)
     return _Read(jnp.sqrt(s), pair.mask, FIELD * _focal_in_sigma(pair), noise_of(s, pair.mask))
 
 
