@@ -96,7 +96,8 @@ def estimate(pairs: Pair | Ragged | Iterable[Pair]) -> TableNoise:
     found, part = _settled(parts, _begin(parts[0], unit))
     if not part.any():
         raise ValueError(
-            "the residuals tell no noise: not enough points agree with one pose of their pair; state the standard deviation"
+            "the residuals tell no noise: not enough points agree with one pose of their pair; "
+            "state the standard deviation"
         )
     noise = _together(found, part)
     return TableNoise(float(noise.sigma), float(noise.deviation), int(part.sum()), len(part))
