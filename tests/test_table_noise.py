@@ -38,19 +38,22 @@ def right(pairs, poses) -> float:
 @pytest.mark.parametrize("make", [aerial, any_position])
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.5])
 @pytest.mark.parametrize(
-    ("pairs", "points", "within"),
-    [(12, 50, 0.15), *(pytest.param(64, points, 0.1, marks=pytest.mark.slow) for points in (16, 50, 200))],
+    ("tables", "pairs", "points", "within"),
+    [(1, 12, 50, 0.15), *(pytest.param(5, 64, points, 0.1, marks=pytest.mark.slow) for points in (16, 50, 200))],
 )
-def test_the_table_tells_its_noise_and_is_cleaned_as_well_with_it(make, share, pairs, points, within):
-    """Within a tenth of the truth, of a few pairs a little more, whose residuals scatter by 4 %; and no fewer right
-    orientations than with the true sigma."""
-    table, wrong = measured(make, pairs, points, share)
-    noise = table_noise.estimate(table)
-    assert abs(noise.sigma / SIGMA - 1) < within
-    assert noise.deviation < 0.1 * SIGMA and noise.pairs > 0.8 * noise.asked
-    poses = jaxro.orient_batch(table.with_mask(~wrong), select=lambda o: o.pose)
-    given = table_noise.TableNoise(SIGMA, 0.0, 0, 0).applied(table)
-    assert right(noise.applied(table), poses) >= right(given, poses) - 0.02
+def test_the_table_tells_its_noise_and_is_cleaned_as_well_with_it(make, share, tables, pairs, points, within):
+    """The median of tables within a tenth of the truth, one of few pairs within a little more; and on the average no
+    fewer right orientations than with the true sigma."""
+    every = [measured(make, pairs, points, share, seed) for seed in range(7, 7 + tables)]
+    noises = [table_noise.estimate(table) for table, _ in every]
+    assert abs(np.median([noise.sigma for noise in noises]) / SIGMA - 1) < within
+    assert all(noise.deviation < 0.1 * SIGMA and noise.pairs > 0.8 * noise.asked for noise in noises)
+    gains = []
+    for (table, wrong), noise in zip(every, noises, strict=True):
+        poses = jaxro.orient_batch(table.with_mask(~wrong), select=lambda o: o.pose)
+        given = table_noise.TableNoise(SIGMA, 0.0, 0, 0).applied(table)
+        gains.append(right(noise.applied(table), poses) - right(given, poses))
+    assert np.mean(gains) >= -0.02
 
 
 def test_sigma_is_in_the_unit_of_the_coordinates_and_a_multiple_of_the_pair_s():
