@@ -70,8 +70,8 @@ def test_the_table_tells_its_noise_and_is_cleaned_as_well_with_it(make, tables, 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [aerial, any_position])
 def test_half_of_sixteen_points_wrong_is_told_less_well(make):
-    """Eight right points have three degrees of freedom, and wrong ones near them look like noise: a fifth is what holds,
-    not a tenth, and some right orientations are lost."""
+    """Eight right points have three degrees of freedom, and wrong ones near them look like noise: a fifth is what
+    holds, not a tenth, and some right orientations are lost."""
     ratios, gains = compared(make, 5, 64, 16, 0.5)
     assert abs(np.median(ratios) - 1) < 0.2
     assert np.mean(gains) >= -0.05
