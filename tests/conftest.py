@@ -38,6 +38,14 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def memory():
+    """Gives back the programs of a file at its end: of all files together they take more than 20 GB."""
+    yield
+    jax.clear_caches()
+    gc.collect()
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """The folder of measured pairs; tests that need it say so when it is not there."""
