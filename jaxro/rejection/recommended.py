@@ -65,8 +65,8 @@ class Plain(AbstractStage):
 
 class Quick(AbstractStage):
     """The graduated search. Believed if at least `share` of the points are kept, or `many`, these pass the global test,
-    and sets as good are not expected by accident more than `accidents` times. A part of a regular field of targets may
-    fit a wrong pose, but it is small; and a plane has two poses, which are to be compared."""
+    and sets as good are not expected by accident more than `accidents` times. A small part of a regular field of
+    targets may fit a wrong pose. A plane has two poses, which `Thorough` compares."""
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
     share: float = 0.6

@@ -4,12 +4,12 @@ Random subsets of five points are solved; each of their orientations is scored b
 
     Σ log(1 + min((r / sigma)², limit²) / FINE²),
 
-first on some of the points, the `judges`, the best on all. Half of |r| lowers it by the same amount for every point
-within the limit, down to FINE. So it tells the right orientation also where sigma is several times too large and more
-points agree with another one, where a cost that grows with r² (MSAC, Torr and Zisserman 2000) does not. The best of
-each block of subsets is improved on the points near it (Chum, Matas and Kittler 2003) and replaces the best so far if
-it costs less. The search ends when a better orientation, of a larger share p of the points, would have been met with
-the probability `confidence`: after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
+first on some of the points, the `judges`, the best on all. Each halving of |r| lowers it by about the same amount, down
+to FINE. So it tells the right orientation also where sigma is several times too large and more points agree with
+another one. A cost that grows with r² (MSAC, Torr and Zisserman 2000) does not tell it there. The best of each block of
+subsets is improved on the points near it (Chum, Matas and Kittler 2003) and replaces the best so far if it costs less.
+The search ends when a better orientation, of a larger share p of the points, would have been met with the probability
+`confidence`: after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
 
 Right matches that lie near each other in one photo lie near each other in the other one. Every second block therefore
 draws from the points whose neighbours agree best. This changes only the order in which orientations are met: the score

@@ -74,7 +74,8 @@ def believed_if_it_fits(
 
     Points that agree with a wrong pose, as those of one depth do, lie about it as far as the limit reaches, and fail
     the global test. If they pass it by far, sigma is too large for it to tell that. Others agree by chance with a
-    probability of about limit / mean |r|, which is much where errors are small: nearly all points need no such proof.
+    probability of about limit / mean |r|. That is large where errors are small, so that nearly all points need no such
+    proof.
     """
     n, k = count(pair.mask), count(use)
     s = squares(pair, pose)

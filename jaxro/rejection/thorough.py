@@ -35,8 +35,8 @@ OVERWHELMING = math.log(1e-9)
 """Logarithm of an expected number of accidents at which a search that came to its end is believed in any case."""
 
 PLENTY = 64.0
-"""Points up to which `accidents` are judged as they are; of more its power by their number over this one: groups of
-repeated structure, which agree with many orientations, are the larger the more points there are."""
+"""Points up to which `accidents` holds as it is. For more, n, it is raised to the power of n / PLENTY: the more points
+there are, the larger are the groups of repeated structure, which agree with many orientations."""
 
 TURNS = 2
 """Searches, the second one with the noise that the first one found."""
