@@ -165,6 +165,21 @@ def test_no_target_of_a_regular_field_is_rejected_for_a_wrong_pose():
 
 
 @pytest.mark.slow
+def test_of_forward_motion_the_best_minimum_is_found():
+    """A base that points into the photo, three in ten matches wrong: other minima, several degrees away, have nearly
+    all points near them. What is left between the best minimum and the truth is noise."""
+    pairs = scenes.photographs(400, 200, 0.3, "forward", seed=3)
+    sigma = np.broadcast_to(pairs.sigma[:, None], pairs.good.shape)
+    photos = jaxro.pair(*pairs.coordinates, focal=pairs.focal, sigma=sigma)
+    select = lambda r: (r.orientation.usable & (r.outcome == OUTCOMES.finished), r.orientation.pose)
+    usable, pose = jaxro.clean_batch(photos, Recommended(), select=select)
+    base = np.stack(jax.vmap(lambda pose: pose.relative()[1])(pose), axis=-1)
+    off = np.linalg.norm(np.cross(base, pairs.base), axis=-1)
+    assert np.mean(usable) >= 0.95
+    assert np.all(off[np.asarray(usable)] < np.sin(np.deg2rad(4)))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.3])
 def test_noise_that_nobody_stated_is_found(share):
     """Sigma left out: the wrong points, and sigma0 of the others within a tenth of the truth on the average."""

@@ -30,6 +30,7 @@ from .base import OUTCOMES, AbstractProcedure, Rejection
 from .fading import faded
 from .graduated_non_convexity import GraduatedNonConvexity
 from .robust import judged, normalised, scaled, seen
+from .search import forward
 from .stages import (
     DEVIATIONS,
     FEW,
@@ -66,7 +67,8 @@ class Plain(AbstractStage):
 class Quick(AbstractStage):
     """The graduated search. Believed if at least `share` of the points are kept, or `many`, these pass the global test,
     and sets as good are not expected by accident more than `accidents` times. A small part of a regular field of
-    targets may fit a wrong pose. A plane has two poses, which `Thorough` compares."""
+    targets may fit a wrong pose. A plane has two poses, and a base that points into a photo several minima, which
+    `Thorough` compares."""
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
     share: float = 0.6
@@ -79,7 +81,7 @@ class Quick(AbstractStage):
         kept = count(decision.use)
         enough = (kept >= self.share * count(pair.mask)) | (kept >= self.many)
         _, _, alone = on_a_plane(pair, decision.pose, decision.use, limit)
-        return decision._replace(believed=decision.believed & enough & ~alone)
+        return decision._replace(believed=decision.believed & enough & ~alone & ~forward(decision.pose))
 
 
 class Recommended(AbstractProcedure):

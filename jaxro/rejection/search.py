@@ -38,6 +38,9 @@ from .robust import seen, stepped
 LUCK = 2.0
 """Subsets of right points alone for one that leads to the right orientation: others are weak, or lose their root."""
 
+FORWARD = 128.0
+"""Subsets, at least, where the base points into a photo."""
+
 PER_SUBSET = 2
 """Orientations that are scored, at most, for each subset on the average of a block."""
 
@@ -118,7 +121,8 @@ class Search(eqx.Module):
 
     def enough(self, pair: Pair, pose: RelativePose) -> Float[Array, ""]:
         """How many subsets are enough, if the share of points that agree with this pose is that of the right ones."""
-        return self.enough_for(count(pair.mask & (squares(pair, pose) <= self.limit**2)), count(pair.mask))
+        subsets = self.enough_for(count(pair.mask & (squares(pair, pose) <= self.limit**2)), count(pair.mask))
+        return jnp.where(forward(pose), jnp.maximum(subsets, FORWARD), subsets)
 
     def enough_for(self, agree: Float[Array, ""], of: Float[Array, ""]) -> Float[Array, ""]:
         """How many subsets are enough to meet the orientation of so many right points."""
@@ -183,6 +187,16 @@ class Search(eqx.Module):
             return stepped(pose, linear, jnp.where(linear.squares <= wide**2, linear.weight, 0.0))
 
         return lax.fori_loop(0, self.steps, step, pose)
+
+
+def forward(pose: RelativePose) -> Bool[Array, ""]:
+    """Whether the base points into a photo: it is nearer to the axis of the left photo than to its plane.
+
+    Small turns and small shifts of the base then look alike. There are other minima, with nearly all points near them,
+    and orientations of five points scatter among these.
+    """
+    _, (x, y, z) = pose.relative()
+    return z**2 > x**2 + y**2
 
 
 class Judgement(NamedTuple):
