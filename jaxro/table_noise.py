@@ -67,6 +67,9 @@ FINDER = Recommended(known=False, stages=(Thorough(search=Search(count=2048)),))
 """Enough subsets for two thirds of wrong points. Pairs that need more can be left out; searches that begin far from the
 noise would go on to their end."""
 
+TELLING = 0.5
+"""Share of the pairs that have to tell their noise: where fewer do, they are those with the least."""
+
 Pairs = TypeVar("Pairs", Pair, Ragged)
 
 
@@ -89,7 +92,7 @@ def estimate(pairs: Pair | Ragged | Iterable[Pair]) -> TableNoise:
     """The noise of pairs of one camera: a batch, `Ragged` pairs, single pairs in a list, or one pair.
 
     Different standard deviations within `pairs` stay in their ratios. Raises ValueError where no pair tells: fewer than
-    six points everywhere, or too few points that agree with a pose to be no accident.
+    six points everywhere, or too few points that agree with a pose to be no accident, or this in most of the pairs.
     """
     chosen = _sample(pairs)
     asked = 0 if chosen is None else len(chosen.x_left)
@@ -104,6 +107,11 @@ def estimate(pairs: Pair | Ragged | Iterable[Pair]) -> TableNoise:
         raise ValueError(
             "the residuals tell no noise: not enough points agree with one pose of their pair; "
             "state the standard deviation"
+        )
+    if part.sum() < TELLING * len(part):
+        raise ValueError(
+            f"only {part.sum()} of {len(part)} pairs have enough points that agree to tell their noise, and those with "
+            "the least noise are the first to: state the standard deviation"
         )
     noise = _together(found, part)
     return TableNoise(float(noise.sigma), float(noise.deviation), int(part.sum()), len(part))

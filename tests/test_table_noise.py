@@ -70,12 +70,12 @@ def test_the_table_tells_its_noise_and_is_cleaned_as_well_with_it(make, tables, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [aerial, any_position])
-def test_half_of_sixteen_points_wrong_is_told_less_well(make):
-    """Eight right points have three degrees of freedom, and wrong ones near them look like noise: a fifth holds,
-    not a tenth, and some right orientations are lost."""
-    ratios, gains = compared(make, 5, 64, 16, 0.5)
-    assert abs(np.median(ratios) - 1) < 0.2
-    assert np.mean(gains) >= -0.05
+def test_half_of_sixteen_points_wrong_tells_no_noise(make):
+    """Few of the pairs have eight right points so near their pose that they are no accident, by chance: their noise is
+    two thirds of that of the others."""
+    table, _ = measured(make, 64, 16, 0.5, 7)
+    with pytest.raises(ValueError, match=r"of 64 pairs have enough .* state the standard deviation"):
+        table_noise.estimate(table)
 
 
 def test_sigma_is_in_the_unit_of_the_coordinates_and_a_multiple_of_the_pair_s():

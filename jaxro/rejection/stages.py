@@ -27,7 +27,7 @@ FEW = 7
 """Points out up to which they are also judged one by one, beginning with all of them."""
 
 NEARLY_ALL = 0.75
-"""Share of the points above which those that are out are the exceptions, of whatever size their errors are."""
+"""Share of the points from which on those that are out are the exceptions, of whatever size their errors are."""
 
 FLAT = 0.6
 """Share of the points kept from which on their plane alone may have chosen between its two poses."""
@@ -82,7 +82,7 @@ def believed_if_it_fits(
     misfit = total(jnp.where(use, s, 0.0))
     low, high = (evidence.chi_squared_limit(d, k - 5) for d in (-DEVIATIONS, DEVIATIONS))
     fits = (misfit >= low) & (misfit <= high) & (k >= share * n) & (k > 5)
-    nearly_all = k > NEARLY_ALL * n
+    nearly_all = k >= NEARLY_ALL * n
     out = pair.mask & ~use
     certain = evidence.accidents(evidence.scattered(s, out, limit), n, k) <= math.log(accidents)
     return Decision(pose, use, fits & (certain | nearly_all), jnp.ones_like(limit))
