@@ -22,8 +22,6 @@ from . import (
     heights as heights,
     layout_design as layout_design,
     levelling as levelling,
-    losses as losses,
-    m_estimates as m_estimates,
     mock_surveys as mock_surveys,
     planes as planes,
     propagation as propagation,
@@ -37,7 +35,7 @@ from . import (
     table_noise as table_noise,
     variance_components as variance_components,
 )
-from .adjustment import Adjustment as Adjustment, adjust as adjust
+from .adjustment import Adjustment as Adjustment, GaussNewton as GaussNewton, adjust as adjust, losses as losses
 from .assessment import identification as identification
 from .assessment.after_cleaning import AfterCleaning as AfterCleaning, after_cleaning as after_cleaning
 from .batch import clean_batch as clean_batch, map_batch as map_batch, orient_batch as orient_batch
@@ -51,7 +49,6 @@ from .elements import (
     to_pose as to_pose,
     vertical as vertical,
 )
-from .normal_equations import GaussNewton as GaussNewton
 from .orientation import Orientation as Orientation, orient as orient
 from .pairs import (
     Camera as Camera,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from .guarded import root
+from .adjustment.guarded import root
 from .orientation import orient
 from .pairs import Pair
 from .propagation import jacobian

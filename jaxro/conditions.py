@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import coplanarity
+from .adjustment.residuals import Residuals
 from .elements import RelativePose
 from .pairs import Coordinates, Pair
-from .residuals import Residuals
 
 Values = Float[Array, "point"]
 

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .adjustment.normal_equations import accumulate, cholesky
 from .conditions import Linear, Values
-from .normal_equations import accumulate, cholesky
 
 UNTESTABLE = 1e-6
 """Redundancy number below which a point is not checked by the others."""

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from . import coplanarity, rotations as rot
+from .adjustment.normal_equations import inner, quadratic
 from .elements import AbstractElements
 from .inspection import Inspection
-from .normal_equations import inner, quadratic
 from .pairs import Pair
 from .programs import stage
 from .reductions import sums

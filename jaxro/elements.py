@@ -23,13 +23,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from . import rotations as rot
-from .normal_equations import directional, slopes
+from .adjustment.normal_equations import directional
+from .adjustment.parameters import AbstractParameters, Step
 from .rotations import Matrix, Vector
 
 Scalar = Float[Array, "..."]
-Step = tuple[Scalar, ...]
-"""Five numbers"""
-
 TINY = 1e-100
 """What stands for a zero that would be divided by."""
 
@@ -37,7 +35,7 @@ NOTHING = 1e-6
 """Component of a unit base that cannot be told from zero."""
 
 
-class AbstractElements(eqx.Module):
+class AbstractElements(AbstractParameters):
     """Five numbers that orient the right photo to the left one."""
 
     names: eqx.AbstractClassVar[tuple[str, ...]]
@@ -51,6 +49,13 @@ class AbstractElements(eqx.Module):
     def model_frame(self) -> Matrix:
         """The rotation R1 that turns vectors of the left photo into the model frame of this system."""
 
+    @property
+    def count(self) -> int:
+        return len(self.names)
+
+    def arguments(self) -> tuple[Matrix, Vector]:
+        return self.relative()
+
     @abc.abstractmethod
     def moved(self, step: Step) -> "AbstractElements":
         """The elements after a small displacement of their five (local) parameters."""
@@ -62,14 +67,6 @@ class AbstractElements(eqx.Module):
     @abc.abstractmethod
     def values(self) -> tuple[Scalar, ...]:
         """The five element values in the order of `names`; for RelativePose the local parameters, all zero."""
-
-    def slopes(self, function: Callable, x: Step) -> tuple[Any, list[Any]]:
-        """function(R, b) of the elements moved by x, and its derivatives along five directions from there."""
-        return slopes(lambda *x: function(*self.moved(x).relative()), x)
-
-    def further(self, x: Step, step: Step) -> Step:
-        """The displacement x followed by a step along the directions of `slopes`."""
-        return tuple(a + b for a, b in zip(x, step, strict=True))
 
     @classmethod
     @abc.abstractmethod

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from . import coplanarity, rotations as rot
+from .adjustment.guarded import root
+from .adjustment.normal_equations import accumulate, quadratic
 from .conditions import Linear, Values
 from .elements import DependentElements, IndependentElements, RelativePose, convert
-from .guarded import root
-from .normal_equations import accumulate, quadratic
 from .orientation import Orientation
 from .pairs import Coordinates, Pair
 from .programs import stage

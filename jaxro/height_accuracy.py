@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, PyTree
 
-from .guarded import root
+from .adjustment.guarded import root
 from .heights import Number
 from .reductions import total
 

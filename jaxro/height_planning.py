@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import ArrayLike
 
-from .guarded import root
+from .adjustment.guarded import root
 from .height_accuracy import Budget, budget
 from .heights import Number, Sight, Square, Station, sighted, sighted_difference
 

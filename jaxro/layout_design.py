@@ -23,14 +23,15 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from . import coplanarity, normal_equations as normal, rotations as rot
-from .adjustment import Adjustment, read
+from . import coplanarity, rotations as rot
+from .adjustment import normal_equations as normal
+from .adjustment.guarded import root
+from .adjustment.least_squares import Adjustment, read
+from .adjustment.residuals import Residuals
 from .elements import AbstractElements, DependentElements, vertical
-from .guarded import root
 from .pairs import Pair
 from .programs import QUICK, Program, traced
 from .reductions import total
-from .residuals import Residuals
 from .simulation import Layout, mock_pair
 
 Positions = tuple[Float[Array, "point"], Float[Array, "point"]]

@@ -13,13 +13,13 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import chosen_elements, coplanarity, critical_values, degeneracy, planes, starts
-from .adjustment import adjust
+from .adjustment.guarded import root, times
+from .adjustment.least_squares import adjust
+from .adjustment.losses import AbstractLoss
+from .adjustment.normal_equations import GaussNewton
 from .elements import AbstractElements, DependentElements, RelativePose, to_pose
-from .guarded import root, times
 from .inspection import Inspection, inspect
-from .losses import AbstractLoss
 from .model_points import model_point
-from .normal_equations import GaussNewton
 from .pairs import Coordinates, Pair, cleaned, double
 from .pointwise import pointwise
 from .programs import FAST, QUICK, QUICKEST, Program, loops, traced, whole
@@ -249,7 +249,7 @@ def _inspected(
     qq, behind = sums((parallax**2, (behind & ~pair.coarse).astype(parallax.dtype)))
     m_q = jnp.where(checked, root(qq / jnp.where(checked, freedom, 1).astype(parallax.dtype)), jnp.nan)
 
-    result = adjustment.result
+    result = RESULTS.promote(adjustment.result)
     fair = result == RESULTS.successful
     worst, worst_chosen = (
         jnp.max(jnp.diagonal(degeneracy.in_radians(of, cofactor)[0]))

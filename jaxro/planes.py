@@ -20,13 +20,13 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import coplanarity, rotations as rot
+from .adjustment.normal_equations import accumulate, solve, steps
+from .adjustment.residuals import Residuals
 from .elements import RelativePose
 from .inspection import inspect
-from .normal_equations import accumulate, solve, steps
 from .pairs import Pair, cleaned
 from .programs import while_loop
 from .reductions import count
-from .residuals import Residuals
 
 TURNS = 2
 """In which points off the plane lose their weight."""

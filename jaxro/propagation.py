@@ -13,12 +13,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .adjustment import Adjustment
-from .guarded import root
+from .adjustment.guarded import root
+from .adjustment.least_squares import Adjustment
+from .adjustment.parameters import as_given, as_parameters
 from .orientation import Orientation
 from .programs import traced
 from .reductions import total
-from .residuals import moved
 
 ROUNDING = 1e-9
 """Of the sum of all parts of a variance: as much below zero as it may come out by rounding."""
@@ -108,7 +108,7 @@ def propagate_adjusted(
 
     For what depends on the elements alone; model points depend on their coordinates as well: see `error_budget`.
     """
-    found = solved.parameters if isinstance(solved, Adjustment) else solved.elements
+    found = as_parameters(solved.parameters if isinstance(solved, Adjustment) else solved.elements)
     variance = jnp.asarray(solved.sigma0 if sigma0 is None else sigma0) ** 2
     origin = jnp.zeros(solved.cofactor.shape[-1], solved.cofactor.dtype)
-    return propagate(lambda step: function(moved(found, tuple(step))), origin, variance * solved.cofactor)
+    return propagate(lambda step: function(as_given(found.moved(tuple(step)))), origin, variance * solved.cofactor)

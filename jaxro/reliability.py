@@ -27,10 +27,10 @@ from jax.scipy.special import betainc, gammainc, gammaincc, ndtr
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import critical_values as critical
+from .adjustment.guarded import root
+from .adjustment.normal_equations import accumulate, inverse
 from .conditions import Linear, linearised
 from .external_reliability import effects
-from .guarded import root
-from .normal_equations import accumulate, inverse
 from .orientation import Orientation
 from .pairs import Coordinates, Pair, cleaned
 from .programs import QUICK, Program, stage, traced

@@ -1,17 +1,17 @@
-"""Every way an orientation or adjustment can end, with advice.
+"""Every way an orientation can end, with advice.
 
 A result is a value, never an exception: inside a batch one bad pair must not harm its neighbours.
 `RESULTS[result]` gives the sentence of one member; `Orientation.check()` raises it for callers who want that.
 """
 
-import optimistix as optx
 from jaxtyping import Array, Bool
 
+from .adjustment import results
 
-class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How an adjustment ended. Members after `two_solutions` mean: do not use the elements."""
 
-    successful = ""
+class RESULTS(results.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How an orientation ended. Where it is not `is_usable`, do not use the elements."""
+
     no_redundancy = (
         "Exactly five points: the elements are determined but nothing checks them, so m_q and sigma0 do not exist. "
         "Measure at least one more point."
@@ -26,10 +26,6 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A coordinate, standard deviation or focal length is NaN, infinite, out of all proportion (a coordinate above "
         "1e9 focal lengths) or not positive where it must be. The point was left out; correct or mask it and orient "
         "again."
-    )
-    rank_deficient = (
-        "The layout does not determine the five elements (points on a line, in one zone, or a needed zone is empty). "
-        "Add points in the empty zones."
     )
     weakly_determined = (
         "For its errors the layout determines the elements too weakly: one of them has a standard deviation above 0.04 "
@@ -54,10 +50,6 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "not: the base is nearly at right angles to the x axis (or along the photo axis), or a photo turned by 90°; or "
         "the given base is no length: 0, not finite, or negative for IndependentElements. Give another base, or use "
         "RelativePose, which exists for every position."
-    )
-    diverged = (
-        "The iterations did not converge. Look for gross errors in the coordinates, the focal lengths and the axes "
-        "(y up), or give a start."
     )
 
 

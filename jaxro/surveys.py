@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from . import critical_values as critical
-from .guarded import root
+from .adjustment.guarded import root
 from .heights import Number, Sight, Square, Station, sighted
 from .levelling import Flags, Levelled, Network, Places, adjust_heights, network
 from .programs import QUICK, Program, traced

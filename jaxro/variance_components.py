@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from . import normal_equations as normal
+from .adjustment import normal_equations as normal
 from .conditions import Linear, linearised
 from .orientation import Orientation
 from .pairs import Pair, cleaned

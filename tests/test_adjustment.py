@@ -7,7 +7,7 @@ import optimistix as optx
 import pytest
 
 import jaxro
-from jaxro import normal_equations
+from jaxro.adjustment import normal_equations
 
 # Levelling net of four unknown heights over one datum point (0): seven observed differences [m], lengths [km].
 FROM = np.array([0, 1, 2, 3, 0, 4, 1])
@@ -38,7 +38,7 @@ def test_levelling_net_equals_normal_equations():
     v = a @ x - RISE
     q = np.linalg.inv(n)
     result = jax.jit(net)(jnp.asarray(RISE))
-    assert result.result == jaxro.RESULTS.successful
+    assert result.result == jaxro.adjustment.RESULTS.successful
     np.testing.assert_allclose(result.parameters, x, atol=1e-13)
     np.testing.assert_allclose(result.cofactor, q, atol=1e-13)
     np.testing.assert_allclose(result.normal_matrix, n, atol=1e-13)
@@ -80,7 +80,7 @@ def test_line_with_errors_in_both_coordinates(solver):
     start = (jnp.asarray(5.0), jnp.asarray(-0.5))
     cofactor = (jnp.asarray(1 / WX), jnp.asarray(1 / WY))
     result = jaxro.adjust(line, start, (jnp.asarray(X), jnp.asarray(Y)), cofactor, solver=solver, max_steps=100)
-    assert result.result == jaxro.RESULTS.successful
+    assert result.result == jaxro.adjustment.RESULTS.successful
     np.testing.assert_allclose(result.parameters, (5.47991022, -0.480533407), rtol=2e-9)
     np.testing.assert_allclose(result.sigma0**2 * 8, 11.8663532, rtol=1e-8)
 
@@ -153,7 +153,7 @@ def test_undetermined_parameter_is_reported():
         (jnp.asarray([0, 1, 0]), jnp.asarray([1, 2, 2]), jnp.asarray([1.0, 1.0, 2.1])),
         (None, None, 1.0),
     )
-    assert result.result == jaxro.RESULTS.rank_deficient
+    assert result.result == jaxro.adjustment.RESULTS.rank_deficient
 
 
 def test_derivatives_along_a_direction_leave_out_what_stays():

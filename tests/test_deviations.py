@@ -8,7 +8,8 @@ import pytest
 import scipy.stats
 
 import jaxro
-from jaxro import IndependentElements, losses, m_estimates, planes, rejection, simulation
+from jaxro import IndependentElements, losses, planes, rejection, simulation
+from jaxro.adjustment import m_estimates
 
 BASE = 70.0
 TRUE = IndependentElements(*(jnp.asarray(e) for e in (0.03, -0.05, 0.04, -0.02, 0.06)))

@@ -49,7 +49,7 @@ def test_traverses_are_the_network_of_all_legs(measured):
     true, rises, q = measured
     heights, cofactor, v, r = oracle(START, END, rises, q, KNOWN, true)
     found = solve(rises, q, true)
-    assert found.result == jaxro.RESULTS.successful
+    assert found.result == jaxro.adjustment.RESULTS.successful
     np.testing.assert_allclose(found.heights, heights, atol=1e-12)
     np.testing.assert_allclose(found.deviations[~KNOWN], np.sqrt(np.diag(cofactor)), atol=1e-12)
     assert not np.any(np.asarray(found.deviations)[KNOWN])

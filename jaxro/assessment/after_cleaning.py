@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from .. import coplanarity, critical_values, rotations as rot
+from ..adjustment.normal_equations import solve
 from ..batch import map_batch
 from ..elements import RelativePose
-from ..normal_equations import solve
 from ..pairs import Pair, cleaned
 from ..reductions import count
 from ..rejection import AbstractProcedure, Rejection

@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .. import coplanarity, normal_equations as normal
+from .. import coplanarity
+from ..adjustment import normal_equations as normal
+from ..adjustment.residuals import Residuals
 from ..conditions import linearised
 from ..orientation import Orientation
 from ..pairs import Pair, cleaned
-from ..residuals import Residuals
 from .neighbours import agreement
 
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from .. import surveys
-from ..results import RESULTS
+from ..adjustment.results import RESULTS
 from . import files
 from .fields import TableError
 from .height_tables import Named

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Array
 
 from .. import critical_values, rotations as rot
+from ..adjustment.guarded import root
 from ..assessment import Pattern, neighbours
 from ..conditions import Linear, linearised
 from ..elements import AbstractElements, DependentElements, RelativePose
-from ..guarded import root
 from ..orientation import Orientation
 from ..pairs import Camera, Coordinates, Pair, cleaned
 from ..programs import FAST, QUICK, Program

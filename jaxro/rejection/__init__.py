@@ -4,7 +4,7 @@ Each is an object with its tolerances as fields: `procedure(pair) -> Rejection`,
 is the one list of them.
 """
 
-from .. import losses
+from ..adjustment import losses
 from .all_subsets import AllSubsets as AllSubsets
 from .base import OUTCOMES as OUTCOMES, AbstractProcedure as AbstractProcedure, Log as Log, Rejection as Rejection
 from .data_snooping import DataSnooping as DataSnooping

@@ -10,8 +10,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .. import critical_values
+from ..adjustment.normal_equations import SINGULAR, accumulate, cholesky, substitute
 from ..conditions import Linear, linearised
-from ..normal_equations import SINGULAR, accumulate, cholesky, substitute
 from ..orientation import orient
 from ..pairs import Pair, cleaned
 from ..reductions import count, total

@@ -11,13 +11,13 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import coplanarity
+from ..adjustment.normal_equations import steps
+from ..adjustment.residuals import Residuals
 from ..elements import AbstractElements, IndependentElements, RelativePose, convert
-from ..normal_equations import steps
 from ..orientation import Orientation, orient
 from ..pairs import Pair
 from ..programs import while_loop
 from ..reductions import count, total
-from ..residuals import Residuals
 from ..results import is_usable
 
 PointValues = Float[Array, "*pairs point"]

@@ -11,12 +11,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import coplanarity, rotations as rot
+from ..adjustment.normal_equations import solve
+from ..adjustment.residuals import Residuals
 from ..elements import RelativePose
-from ..normal_equations import solve
 from ..pairs import Pair
 from ..programs import stage
 from ..reductions import count
-from ..residuals import Residuals
 from ..rotations import Matrix, Vector
 from ..starts import AbstractStart, Vertical
 from ..starts.decomposition import best_pose

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .. import critical_values
+from ..adjustment.normal_equations import accumulate, cholesky, substitute
 from ..elements import AbstractElements
-from ..normal_equations import accumulate, cholesky, substitute
 from ..orientation import orient
 from ..pairs import Pair, cleaned
 from ..programs import stage

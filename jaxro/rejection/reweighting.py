@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..adjustment.losses import AbstractWeight, Huber, Tukey
 from ..conditions import linearised
 from ..elements import RelativePose
-from ..losses import AbstractWeight, Huber, Tukey
 from ..pairs import Pair, cleaned
 from ..programs import while_loop
 from ..reductions import count

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .. import coplanarity, rotations as rot
+from ..adjustment.normal_equations import accumulate, cholesky, solve, substitute
 from ..conditions import Linear, linearised
 from ..elements import RelativePose
-from ..normal_equations import accumulate, cholesky, solve, substitute
 from ..orientation import orient
 from ..pairs import Pair
 from ..programs import while_loop

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
 from .. import coplanarity
+from ..adjustment import normal_equations as normal
+from ..adjustment.residuals import Residuals
 from ..elements import AbstractElements, RelativePose, vertical
-from ..normal_equations import steps
 from ..pairs import Pair
-from ..residuals import Residuals
 
 LONGEST = 0.5
 """Longest component of a step towards a start (rad)."""
@@ -62,6 +62,10 @@ class FirstOrder(NamedTuple):
         slopes = [[1 + y * v], [-y * u], [u], [y * u - x * v], [x - u]]
         return [v - y], slopes, [jnp.where(pair.mask, 1 / pair.sigma**2, 0.0)]
 
+    def correction(self, x: tuple[Array, ...]) -> tuple[Array, ...]:
+        """What Gauss-Newton subtracts from the elements."""
+        return normal.correction(self.columns(x))
+
     def further(self, x: tuple[Array, ...], step: tuple[Array, ...]) -> tuple[Array, ...]:
         """The elements after a step."""
         return tuple(a + b for a, b in zip(x, step, strict=True))
@@ -77,12 +81,12 @@ def approached(pair: Pair, count: int) -> RelativePose:
     if count == 0:
         return pose
     zero = (jnp.zeros_like(pair.focal_left),) * 5
-    near = _moved(pose, steps(FirstOrder(pair), zero, 1, LONGEST))
+    near = _moved(pose, normal.steps(FirstOrder(pair), zero, 1, LONGEST))
     if count == 1:
         return near
     single, points = _with_dtype(jnp.float32, near), _with_dtype(jnp.float32, pair)
     zero = (jnp.zeros_like(points.focal_left),) * 5
-    return _moved(near, steps(distances(points, single), zero, count - 1, LONGEST))
+    return _moved(near, normal.steps(distances(points, single), zero, count - 1, LONGEST))
 
 
 def _moved(pose: RelativePose, step: tuple[Array, ...]) -> RelativePose:

@@ -11,11 +11,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .. import degeneracy, planes, rotations as rot
+from ..adjustment.normal_equations import steps
 from ..coplanarity import common_focal
 from ..degeneracy import significant
 from ..elements import RelativePose, vertical
 from ..inspection import inspect
-from ..normal_equations import steps
 from ..pairs import Pair, cleaned, pad
 from ..selection import where_needed
 from .base import AbstractStart, Begin, distances

@@ -8,7 +8,8 @@ matrix, cofactors, redundancy, sigma0. Observation equations l = f(x) are the ca
 linear in l are satisfied to first order in v (the second order is |v| over the radius of curvature).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import overload
 
 import equinox as eqx
 import jax
@@ -16,15 +17,17 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from ..pointwise import pointwise
+from ..programs import part
 from . import normal_equations as normal
-from .elements import AbstractElements
 from .guarded import root, times
+from .joint import JointAdjustment, adjust_jointly
 from .losses import AbstractLoss
 from .m_estimates import spread
-from .pointwise import pointwise
-from .programs import part
-from .residuals import Parameters, Residuals, dimension, moved, residuals_of, reweighted, together
+from .parameters import as_given, as_parameters
+from .residuals import Residuals, residuals_of, reweighted, together
 from .results import RESULTS
+from .terms import Families, Term
 
 
 class Adjustment(eqx.Module):
@@ -34,7 +37,7 @@ class Adjustment(eqx.Module):
     `cofactor` is that of the parameters (for `RelativePose`, of its five local parameters at the solution).
     """
 
-    parameters: Parameters
+    parameters: PyTree
     normal_matrix: Float[Array, "p p"]
     cofactor: Float[Array, "p p"]
     residuals: Float[Array, " group"] | Float[Array, "group m"]
@@ -50,9 +53,10 @@ class Adjustment(eqx.Module):
         return times(self.cofactor, (self.sigma0 if sigma0 is None else jnp.asarray(sigma0)) ** 2)
 
 
+@overload
 def adjust(
     condition: Callable,
-    start: Parameters,
+    start: PyTree,
     observations: PyTree,
     cofactor: PyTree,
     mask: Bool[Array, " group"] | None = None,
@@ -61,31 +65,75 @@ def adjust(
     loss: AbstractLoss | None = None,
     solver: optx.AbstractLeastSquaresSolver | None = None,
     max_steps: int = 30,
-) -> Adjustment:
+) -> Adjustment: ...
+
+
+@overload
+def adjust(
+    condition: Term | Sequence[Term],
+    start: Families,
+    *,
+    eliminate: str | None = None,
+    constraints: Callable | None = None,
+    loss: AbstractLoss | None = None,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
+    max_steps: int = 30,
+) -> JointAdjustment: ...
+
+
+def adjust(
+    condition,
+    start,
+    observations=None,
+    cofactor=None,
+    mask=None,
+    *,
+    prepare: Callable | None = None,
+    eliminate: str | None = None,
+    constraints: Callable | None = None,
+    loss: AbstractLoss | None = None,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
+    max_steps: int = 30,
+) -> Adjustment | JointAdjustment:
     """Adjust parameters to measurements: Σ |L_i⁻¹ g(x, l_i)|² = min, or Σ rho of it with a robust loss.
 
     `condition(parameters, observation)` of one group returns a number or m of them. `observations`: a pytree whose
     leaves have the groups on the first axis; `cofactor`: its variances (relative to sigma0²), a tree that may end above
     the leaves and then holds for all of them: numbers or one per group, None for what is free of error. `mask` selects
-    groups. `start`: elements, or any pytree of numbers.
-    `prepare`: what all groups share, computed once; the condition then gets prepare(parameters) for the parameters, and
-    with elements prepare(R, b) of their `relative`.
+    groups. `start`: `AbstractParameters`, or any pytree of numbers.
+    `prepare`: what all groups share, computed once; the condition then gets prepare(*arguments) for the parameters, of
+    their `arguments`.
     `solver`: any optimistix least-squares solver; `GaussNewton()` if None.
 
     With a loss, normal matrix and redundancy carry the final weights rho'(r²); sigma0 is consistent for normal errors,
     and sigma0² times `cofactor` is the sandwich covariance of the M-estimate (`m_estimates`), so that the cofactors are
     not the inverse of the normal matrix. Derivatives of every field by the observations and cofactors are exact
     (implicit function theorem). Failures are values of `result`, never exceptions.
+
+    Several kinds of conditions between many blocks of parameters (cameras, object points): `adjust(terms, start)` with
+    a list of `Term` in place of the condition, and with the families of blocks by name as `start`. `eliminate` names
+    the family with the most blocks, if no condition joins two of them; only its Schur complement is then inverted.
+    `constraints(parameters)`: numbers of the kept families that are to become zero, as the datum of a free network.
     """
+    if isinstance(condition, Term | Sequence):
+        terms = (condition,) if isinstance(condition, Term) else tuple(condition)
+        return adjust_jointly(
+            terms,
+            start,
+            eliminate=eliminate,
+            constraints=constraints,
+            loss=loss,
+            solver=solver,
+            max_steps=max_steps,
+        )
     groups = jax.tree.leaves(observations)[0].shape[0]
     if mask is None:
         mask = jnp.ones(groups, bool)
     dtype = jax.tree.leaves(start)[0].dtype
     cofactor = jax.tree.map(lambda q: jnp.broadcast_to(jnp.asarray(q, dtype), (groups, *jnp.shape(q)[1:])), cofactor)
-    start = jax.lax.stop_gradient(start)  # the optimum does not depend on where it is sought
+    start = as_parameters(jax.lax.stop_gradient(start))  # the optimum does not depend on where it is sought
     residuals = residuals_of(condition, prepare, start, observations, cofactor, mask, loss)
-    p = dimension(start)
-    origin = tuple(jnp.zeros((), jax.tree.leaves(start)[0].dtype) for _ in range(p))
+    origin = (jnp.zeros((), dtype),) * start.count
     solve = lambda origin, residuals: optx.least_squares(
         lambda x, residuals: residuals(x),
         normal.GaussNewton() if solver is None else solver,
@@ -96,9 +144,7 @@ def adjust(
         throw=False,
     )
     solution = part(solve)(origin, residuals)
-    parameters = moved(start, solution.value)
-    if isinstance(parameters, AbstractElements):
-        parameters = parameters.normalised()
+    parameters = start.moved(solution.value).normalised()
     converged = solution.result == optx.RESULTS.successful
     at_solution = eqx.tree_at(
         lambda r: (r.centre, r.loss), residuals, (parameters, None), is_leaf=lambda leaf: leaf is None
@@ -108,7 +154,7 @@ def adjust(
 
 def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged) -> Adjustment:
     """Everything that follows from the linearisation at the solution, the centre of `residuals`."""
-    p = dimension(residuals.centre)
+    p = residuals.centre.count
     origin = (jnp.zeros((), jax.tree.leaves(residuals.centre)[0].dtype),) * p
     linearised = residuals.linearised(origin)
     groups = residuals.observations, residuals.cofactor, residuals.mask
@@ -141,7 +187,7 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)
     result = RESULTS.where(pivot < normal.SINGULAR, RESULTS.rank_deficient, result)
     return Adjustment(
-        residuals.centre,
+        as_given(residuals.centre),
         normal.dense(n),
         cofactor,
         together(white),

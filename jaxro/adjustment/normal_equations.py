@@ -3,7 +3,7 @@
 For p parameters the p(p+1)/2 + p + 1 sums N = JᵀJ, h = Jᵀr and rᵀr are accumulated by one variadic reduction over the
 residuals, so that no Jacobian is ever stored, and the system is solved by an unrolled Cholesky factorisation. Under
 `vmap` every operation is element-wise over the pairs: no LAPACK (which deadlocks from two threads) and no batched
-matrix product. Above `UNROLLED` parameters the dense routines take over.
+matrix product. Above `UNROLLED` parameters `symmetric` takes over.
 """
 
 import itertools
@@ -19,8 +19,9 @@ from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .programs import part, stage
-from .reductions import sums
+from ..programs import part, stage
+from ..reductions import sums
+from . import symmetric
 
 Scalar = Float[Array, ""]
 Scalars = Sequence[Any]
@@ -158,18 +159,22 @@ def dense(n: Lower) -> Float[Array, "p p"]:
 def solve(n: Lower, h: Scalars) -> list[Scalar]:
     """N⁻¹ h."""
     if len(h) > UNROLLED:
-        return list(jnp.linalg.solve(dense(n), jnp.stack(list(h))))
+        return list(symmetric.inverse(dense(n)).matrix @ jnp.stack(list(h)))
     return stage(lambda n, h: substitute(cholesky(n)[0], h))(n, h)
 
 
-def inverse(n: Lower) -> tuple[Lower, Scalar]:
+def correction(linear: tuple[Columns, Sequence[Columns], Columns | None]) -> tuple[Scalar, ...]:
+    """What Gauss-Newton subtracts from the parameters, from residuals, columns and weights."""
+    n, h, _ = accumulate(*linear)
+    return tuple(solve(n, h))
+
+
+def inverse(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
     """The lower triangle of N⁻¹ and the smallest relative pivot."""
     p = len(n)
     if p > UNROLLED:
-        scale = lax.rsqrt(jnp.stack([n[i][i] for i in range(p)]))
-        scaled = dense(n) * scale[:, None] * scale[None, :]
-        full = jnp.linalg.inv(scaled) * scale[:, None] * scale[None, :]
-        return [[full[i, j] for j in range(i + 1)] for i in range(p)], jnp.min(jnp.linalg.eigvalsh(scaled))
+        full, pivots = symmetric.inverse(dense(n))
+        return [[full[i, j] for j in range(i + 1)] for i in range(p)], jnp.min(pivots)
     factor, pivot = cholesky(n)
     zero, one = jnp.zeros_like(n[0][0]), jnp.ones_like(n[0][0])
     solved = [substitute(factor, [one if i == k else zero for i in range(p)]) for k in range(p)]
@@ -179,8 +184,8 @@ def inverse(n: Lower) -> tuple[Lower, Scalar]:
 class GaussNewton(optx.AbstractLeastSquaresSolver):
     """Gauss-Newton for a few parameters; its loop carries the parameters and two step sizes, nothing else.
 
-    `args` that know their own residuals and columns, and how a step follows others (`residuals.Residuals`), are asked
-    for them; any other residual function is linearised. Ends when the *next* step, predicted from the last two, is
+    `args` that know their own correction, and how a step follows others (`residuals.Residuals`, `joint.Joint`), are
+    asked for it; any other residual function is linearised. Ends when the *next* step, predicted from the last two, is
     below atol + rtol |x|, or below ROUNDING in their place if steps no longer fall: they are rounding errors then.
     `max_step` bounds the largest component of a step (0.5 rad for orientations, where a
     longer one leaves the range of the linearisation).
@@ -196,31 +201,19 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
         return jnp.asarray(jnp.inf, dtype), jnp.zeros((), dtype)
 
     def step(self, fn, y, args, options, state, tags):
-        leaves, structure = jax.tree.flatten(y)
-        known = hasattr(args, "columns")
-        if known:
-            r, jacobian, weight = args.columns(tuple(leaves))
-        else:
-            r, jacobian, weight = columns(
-                lambda x: ravel_pytree(fn(jax.tree.unflatten(structure, x), args)[0])[0], leaves
-            )
-        n, h, _ = accumulate(r, jacobian, weight)
-        delta = solve(n, h)
-        longest = delta[0] * 0
-        for d in delta:
-            longest = jnp.maximum(longest, jnp.abs(d))
+        known = hasattr(args, "correction")
+        delta = args.correction(y) if known else _correction(fn, y, args)
+        longest = _largest(delta)
         shrink = jnp.minimum(1.0, self.max_step / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny))
-        taken = tuple(-shrink * d for d in delta)
-        moved = args.further(tuple(leaves), taken) if known else [x + d for x, d in zip(leaves, taken, strict=True)]
-        largest = longest * 0
-        for x in moved:
-            largest = jnp.maximum(largest, jnp.abs(x))
+        taken = jax.tree.map(lambda d: -shrink * d, delta)
+        moved = args.further(y, taken) if known else jax.tree.map(jnp.add, y, taken)
+        largest = _largest(moved)
         size = longest / (self.atol + self.rtol * largest)
         previous = state[1]
         ratio = jnp.where(previous > 0, jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)), 1.0)
         rounding = (previous > 0) & (ratio >= 1)  # a first step tells nothing of how they fall
         predicted = size * jnp.where(rounding, min(1.0, self.atol / ROUNDING), ratio)
-        return jax.tree.unflatten(structure, moved), (predicted, size), None
+        return moved, (predicted, size), None
 
     def terminate(self, fn, y, args, options, state, tags):
         return state[0] < 1, optx.RESULTS.successful
@@ -229,8 +222,29 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
         return y, aux, {}
 
 
+def _correction(fn: Callable, y: PyTree, args: PyTree) -> PyTree:
+    """What Gauss-Newton subtracts from the parameters of any residual function."""
+    leaves, structure = jax.tree.flatten(y)
+    if any(jnp.ndim(leaf) for leaf in leaves):
+        flat, unravel = ravel_pytree(y)
+        residual = lambda flat: ravel_pytree(fn(unravel(flat), args)[0])[0]
+        jacobian = jax.jacfwd(residual)(flat)
+        return unravel(symmetric.inverse(jacobian.T @ jacobian).matrix @ (jacobian.T @ residual(flat)))
+    residual = lambda *x: ravel_pytree(fn(jax.tree.unflatten(structure, x), args)[0])[0]
+    return jax.tree.unflatten(structure, correction(columns(residual, leaves)))
+
+
+def _largest(tree: PyTree) -> Scalar:
+    """The largest absolute value of the leaves, numbers or arrays."""
+    leaves = [jnp.abs(a) if jnp.ndim(a) == 0 else jnp.max(jnp.abs(a)) for a in jax.tree.leaves(tree)]
+    largest = leaves[0] * 0
+    for leaf in leaves:
+        largest = jnp.maximum(largest, leaf)
+    return largest
+
+
 class SmallCholesky(lx.AbstractLinearSolver):
-    """The unrolled Cholesky as a lineax solver, for the positive definite system of implicit differentiation."""
+    """The solution of the positive definite system of implicit differentiation, as a lineax solver."""
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
         return operator.as_matrix()
@@ -238,8 +252,11 @@ class SmallCholesky(lx.AbstractLinearSolver):
     def compute(self, state, vector, options):
         flat, unravel = ravel_pytree(vector)
         p = flat.shape[0]
-        lower = [[(state[i, j] + state[j, i]) / 2 for j in range(i + 1)] for i in range(p)]
-        x = jnp.stack(solve(lower, [flat[i] for i in range(p)]))
+        if p > UNROLLED:
+            x = symmetric.inverse((state + state.T) / 2).matrix @ flat
+        else:
+            lower = [[(state[i, j] + state[j, i]) / 2 for j in range(i + 1)] for i in range(p)]
+            x = jnp.stack(solve(lower, [flat[i] for i in range(p)]))
         # lineax would stop the whole batch for one pair without a derivative
         return unravel(jnp.where(jnp.isfinite(x), x, 0.0)), lx.RESULTS.successful, {}
 

@@ -13,33 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from . import normal_equations as normal
-from .elements import AbstractElements
 from .losses import AbstractLoss
-
-Parameters = Any
-
-
-def moved(parameters: Parameters, step: tuple) -> Parameters:
-    """The parameters displaced by their local coordinates; plain pytrees by addition."""
-    if isinstance(parameters, AbstractElements):
-        return parameters.moved(step)
-    leaves, structure = jax.tree.flatten(parameters)
-    rest, out = list(step), []
-    for leaf in leaves:
-        size = jnp.size(leaf)
-        out.append(leaf + (rest[0] if jnp.ndim(leaf) == 0 else jnp.stack(rest[:size]).reshape(jnp.shape(leaf))))
-        rest = rest[size:]
-    return jax.tree.unflatten(structure, out)
+from .parameters import AbstractParameters, as_given
 
 
-def dimension(parameters: Parameters) -> int:
-    """The number of local parameters."""
-    if isinstance(parameters, AbstractElements):
-        return len(parameters.names)
-    return sum(jnp.size(leaf) for leaf in jax.tree.leaves(parameters))
-
-
-def discrepancy(condition: Callable, parameters: Parameters, observation: PyTree, cofactor: PyTree, use):
+def discrepancy(condition: Callable, parameters: PyTree, observation: PyTree, cofactor: PyTree, use):
     """The m entries of g of one group, and the lower triangle of B Q Bᵀ (the unit matrix where it is not used).
 
     A cofactor stands for every entry of its part of the observation; entries whose cofactor is None are free of error.
@@ -96,13 +74,13 @@ def whitened(g: list, d: list, use) -> list:
 class Residuals(eqx.Module):
     """The whitened residuals of all groups as a function of a displacement x of the parameters from `centre`.
 
-    What the groups share is computed once by `prepare(parameters)`, of elements `prepare(R, b)`; its few numbers θ are
-    what a group's condition sees.
+    What the groups share is computed once by `prepare` of the `arguments` of the parameters; its few numbers θ are what
+    a group's condition sees. Without it that sees the parameters.
     """
 
     prepare: Callable | None
     condition: Callable
-    centre: Parameters
+    centre: AbstractParameters
     observations: PyTree
     cofactor: PyTree
     mask: Bool[Array, " group"]
@@ -110,21 +88,21 @@ class Residuals(eqx.Module):
 
     def shared(self, *x: Array) -> PyTree:
         """θ(x): what `prepare` makes of the parameters, or the parameters themselves."""
-        parameters = moved(self.centre, x)
-        return self._prepared(*(parameters.relative() if self._of_elements else (parameters,)))
+        parameters = self.centre.moved(x)
+        return as_given(parameters) if self.prepare is None else self.prepared(*parameters.arguments())
 
-    @property
-    def _of_elements(self) -> bool:
-        return self.prepare is not None and isinstance(self.centre, AbstractElements)
+    def prepared(self, *arguments) -> PyTree:
+        return jax.tree.map(jnp.asarray, self.prepare(*arguments))  # pyright: ignore[reportOptionalCall]
 
-    def _prepared(self, *parameters) -> PyTree:
-        return parameters[0] if self.prepare is None else jax.tree.map(jnp.asarray, self.prepare(*parameters))
+    def correction(self, x: tuple[Array, ...]) -> tuple[Array, ...]:
+        """What Gauss-Newton subtracts from the displacement."""
+        return normal.correction(self.columns(x))
 
     def further(self, x: tuple[Array, ...], step: tuple[Array, ...]) -> tuple[Array, ...]:
         """The displacement x followed by a step, which has the directions of `columns`."""
-        if self._of_elements:
-            return self.centre.further(x, step)
-        return tuple(a + b for a, b in zip(x, step, strict=True))
+        if self.prepare is None:
+            return tuple(a + b for a, b in zip(x, step, strict=True))
+        return self.centre.further(x, step)
 
     def groups(self, function: Callable, theta: PyTree) -> Any:
         """function(g, B Q Bᵀ, use) of every group."""
@@ -153,10 +131,10 @@ class Residuals(eqx.Module):
         weight rho'(r²): steps are those of iteratively reweighted least squares, which do not overshoot as those of
         the transformed residual may.
         """
-        if self._of_elements:
-            theta, along = self.centre.slopes(self._prepared, x)
-        else:
+        if self.prepare is None:
             theta, along = normal.slopes(self.shared, x)
+        else:
+            theta, along = self.centre.slopes(self.prepared, x)
 
         def one(observation, cofactor, use):
             at = lambda theta: discrepancy(self.condition, theta, observation, cofactor, use)
@@ -189,11 +167,10 @@ def together(entries: list) -> Float[Array, " group"] | Float[Array, "group m"]:
 def residuals_of(condition, prepare, centre, observations, cofactor, mask, loss=None) -> Residuals:
     """`Residuals` whose functions carry what they close over as arguments, so that it can be differentiated."""
     if prepare is not None:
-        parameters = centre.relative() if isinstance(centre, AbstractElements) else (centre,)
-        prepare = eqx.filter_closure_convert(prepare, *parameters)
-        prepared = jax.eval_shape(prepare, *parameters)
+        prepare = eqx.filter_closure_convert(prepare, *centre.arguments())
+        prepared = jax.eval_shape(prepare, *centre.arguments())
     else:
-        prepared = centre
+        prepared = as_given(centre)
     first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), observations)
     condition = eqx.filter_closure_convert(condition, prepared, first)
     return Residuals(prepare, condition, centre, observations, cofactor, mask, loss)

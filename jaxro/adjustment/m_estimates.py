@@ -34,8 +34,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..reductions import total
 from .losses import AbstractLoss
-from .reductions import total
 
 Scalar = Float[Array, ""]
 

@@ -1,0 +1,171 @@
+"""The adjustment of several kinds of conditions between blocks of parameters, all at once."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+
+from . import elimination, normal_equations as normal
+from .elimination import Layout, Solution
+from .guarded import root, times
+from .losses import AbstractLoss
+from .m_estimates import spread
+from .results import RESULTS
+from .terms import Families, Linearised, Steps, Term, closed, linearised, moved, residuals
+
+
+class JointAdjustment(eqx.Module):
+    """A finished adjustment of blocks of parameters by several terms.
+
+    `parameters`: by the name of their family, as they were given. `cofactor`: of all local parameters of the kept
+    families, in their order. `residuals` (whitened) and `redundancy`: of each term, (group, m). `sigma0` is NaN without
+    a degree of freedom. `pivot`: the least part of the diagonal of a parameter that those before it leave.
+    """
+
+    parameters: dict[str, PyTree]
+    cofactor: Float[Array, "kept kept"]
+    residuals: tuple[Float[Array, "_ _"], ...]
+    redundancy: tuple[Float[Array, "_ _"], ...]
+    sigma0: Float[Array, ""]
+    pivot: Float[Array, ""]
+    degrees_of_freedom: Int[Array, ""]
+    iterations: Int[Array, ""]
+    result: RESULTS
+    solution: Solution
+    layout: Layout
+
+    def cofactors(self, name: str) -> Float[Array, "member d d"]:
+        """The cofactors of the local parameters of each member of a family."""
+        return elimination.cofactors(self.layout, self.solution, name)
+
+    def covariance(self, name: str, sigma0: ArrayLike | None = None) -> Float[Array, "member d d"]:
+        """sigma0² Q of each member of a family: a posteriori, or a priori with the sigma0 given."""
+        return times(self.cofactors(name), (self.sigma0 if sigma0 is None else jnp.asarray(sigma0)) ** 2)
+
+
+class Joint(eqx.Module):
+    """The residuals of all terms as a function of displacements of the families, and how to correct these."""
+
+    terms: tuple[Term, ...]
+    families: dict[str, PyTree]
+    layout: Layout
+    constraints: Callable | None
+    loss: AbstractLoss | None
+
+    def __call__(self, steps: Steps) -> list[Array]:
+        """The whitened (and, with a loss, transformed) residuals of every term."""
+        found = [residuals(term, self.families, steps) for term in self.terms]
+        return found if self.loss is None else [self.loss.transformed(r) for r in found]
+
+    def correction(self, steps: Steps) -> Steps:
+        """What Gauss-Newton subtracts from the displacements."""
+        found = self.solved(steps, self.linearised(steps), self.loss)
+        blocks = found.eliminated
+        return self.layout.divided(found.step, None if blocks is None else blocks.steps)
+
+    def further(self, steps: Steps, step: Steps) -> Steps:
+        """The displacements followed by a step."""
+        return jax.tree.map(jnp.add, steps, step)
+
+    def linearised(self, steps: Steps) -> list[Linearised]:
+        return [linearised(term, self.families, steps) for term in self.terms]
+
+    def solved(self, steps: Steps, parts: list[Linearised], loss: AbstractLoss | None) -> Solution:
+        """The solution of the normal equations with the weights of a loss."""
+        normals = elimination.accumulate(self.layout, self.terms, [_weighted(part, loss) for part in parts])
+        return elimination.solve(normals, self._constraint(steps))
+
+    def _constraint(self, steps: Steps) -> tuple[Array, Array] | None:
+        if self.constraints is None:
+            return None
+        block = self.layout.eliminated
+        eliminated = None if block is None else steps[block.name]
+
+        def of_kept(kept):
+            steps = self.layout.divided(kept, eliminated)
+            families = {name: moved(self.families[name], step) for name, step in steps.items()}
+            return jnp.atleast_1d(self.constraints(families))  # pyright: ignore[reportOptionalCall]
+
+        kept = jnp.concatenate([steps[block.name].reshape(-1) for block in self.layout.kept])
+        return jax.jacrev(of_kept)(kept), of_kept(kept)
+
+
+def adjust_jointly(
+    terms: tuple[Term, ...],
+    start: Families,
+    *,
+    eliminate: str | None = None,
+    constraints: Callable | None = None,
+    loss: AbstractLoss | None = None,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
+    max_steps: int = 30,
+) -> JointAdjustment:
+    """What `adjust` does for several terms."""
+    families = {name: jax.tree.map(jnp.asarray, family) for name, family in start.items()}
+    families = jax.lax.stop_gradient(families)  # the optimum does not depend on where it is sought
+    layout = elimination.layout(families, terms, eliminate)
+    terms = tuple(closed(term, families) for term in terms)
+    joint = Joint(terms, families, layout, constraints, loss)
+    origin = {block.name: jnp.zeros((block.members, block.size), float) for block in layout.blocks}
+    found = optx.least_squares(
+        lambda steps, joint: joint(steps),
+        normal.GaussNewton() if solver is None else solver,
+        origin,
+        args=joint,
+        max_steps=max_steps,
+        adjoint=optx.ImplicitAdjoint(linear_solver=normal.SmallCholesky()),
+        throw=False,
+    )
+    return _read(joint, found.value, found.stats["num_steps"], found.result == optx.RESULTS.successful)
+
+
+def _read(joint: Joint, steps: Steps, iterations: Int[Array, ""], converged: Bool[Array, ""]) -> JointAdjustment:
+    """Everything that follows from the linearisation at the solution."""
+    layout, terms, loss = joint.layout, joint.terms, joint.loss
+    parts = joint.linearised(steps)
+    weighted = joint.solved(steps, parts, loss)
+    rows = jnp.concatenate([part.residuals.reshape(-1) for part in parts])
+    use = jnp.concatenate([jnp.repeat(t.mask, part.residuals.shape[1]) for t, part in zip(terms, parts, strict=True)])
+    known = 0 if joint.constraints is None else joint._constraint(steps)[1].shape[0]  # pyright: ignore[reportOptionalSubscript]
+    freedom = jnp.sum(use) - (layout.total - known)
+    checked = freedom > 0
+    solution = weighted
+    if loss is None:
+        sigma0 = root(jnp.sum(rows**2) / jnp.where(checked, freedom, 1).astype(rows.dtype))
+    else:
+        sigma0, factor = spread(loss, rows, use.astype(rows.dtype), layout.total - known)
+        factor = jnp.where(checked, factor, 1.0)
+        plain = joint.solved(steps, parts, None)
+        blocks = plain.eliminated
+        blocks = None if blocks is None else blocks._replace(inverse=factor * blocks.inverse)
+        solution = plain._replace(cofactor=factor * plain.cofactor, eliminated=blocks)
+    pivot = jnp.min(weighted.pivots)
+    result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)
+    result = RESULTS.where(pivot < normal.SINGULAR, RESULTS.rank_deficient, result)
+    return JointAdjustment(
+        parameters={name: moved(joint.families[name], step) for name, step in steps.items()},
+        cofactor=solution.cofactor,
+        residuals=tuple(part.residuals for part in parts),
+        redundancy=tuple(
+            elimination.redundancies(layout, weighted, term, _weighted(part, loss))
+            for term, part in zip(terms, parts, strict=True)
+        ),
+        sigma0=jnp.where(checked, sigma0, jnp.nan),
+        pivot=pivot,
+        degrees_of_freedom=freedom,
+        iterations=iterations,
+        result=result,
+        solution=solution,
+        layout=layout,
+    )
+
+
+def _weighted(part: Linearised, loss: AbstractLoss | None) -> Linearised:
+    """Residuals and columns times the roots of the weights rho'(r²)."""
+    if loss is None:
+        return part
+    weight = jnp.sqrt(loss.weight(part.residuals**2))
+    return Linearised(weight * part.residuals, tuple(weight[:, :, None] * a for a in part.columns))
