@@ -81,12 +81,10 @@ class Joint(eqx.Module):
     def _constraint(self, steps: Steps) -> tuple[Array, Array] | None:
         if self.constraints is None:
             return None
-        block = self.layout.eliminated
-        eliminated = None if block is None else steps[block.name]
 
         def of_kept(kept):
-            steps = self.layout.divided(kept, eliminated)
-            families = {name: moved(self.families[name], step) for name, step in steps.items()}
+            steps = self.layout.divided(kept, None)
+            families = {b.name: moved(self.families[b.name], steps[b.name]) for b in self.layout.kept}
             return jnp.atleast_1d(self.constraints(families))  # pyright: ignore[reportOptionalCall]
 
         kept = jnp.concatenate([steps[block.name].reshape(-1) for block in self.layout.kept])
