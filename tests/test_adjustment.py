@@ -144,6 +144,10 @@ def test_more_parameters_than_are_unrolled():
     )
     np.testing.assert_allclose(result.parameters, np.linalg.lstsq(a[:, 1:], rise, rcond=None)[0], atol=1e-12)
     np.testing.assert_allclose(result.cofactor, np.linalg.inv(a[:, 1:].T @ a[:, 1:]), atol=1e-12)
+    np.testing.assert_allclose(result.normal_matrix, a[:, 1:].T @ a[:, 1:], atol=1e-12)
+    np.testing.assert_allclose(result.residuals, a[:, 1:] @ np.asarray(result.parameters) - rise, atol=1e-12)
+    redundancy = 1 - np.sum(a[:, 1:] * (a[:, 1:] @ np.asarray(result.cofactor)), axis=1)
+    np.testing.assert_allclose(result.redundancy, redundancy, atol=1e-12)
 
 
 def test_undetermined_parameter_is_reported():

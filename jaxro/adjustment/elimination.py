@@ -168,9 +168,10 @@ class Carried(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """The step of the kept parameters and their cofactors, the solution of the eliminated blocks, if there are any, and
-    of the parameters what those before them leave of their diagonal (`pivots`)."""
+    """The normal matrix of the kept parameters, their step and their cofactors; the solution of the eliminated blocks,
+    if there are any; and what the parameters before each one leave of its diagonal (`pivots`)."""
 
+    normal_matrix: Matrix
     step: Vector
     cofactor: Matrix
     eliminated: Carried | None
@@ -184,13 +185,14 @@ def solve(normals: Normals, constraint: tuple[Float[Array, "c kept"], Float[Arra
     scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
     if sums is None:
         q, step, pivots = _kept(n, h, scale, constraint)
-        return Solution(step, q, None, pivots)
+        return Solution(n, step, q, None, pivots)
     inverse, of_blocks = _inverses(sums.v)
     by_kept = inverse @ sums.w
     rows, flat = sums.w.reshape(-1, n.shape[0]), by_kept.reshape(-1, n.shape[0])
-    q, step, pivots = _kept(n - rows.T @ flat, h - flat.T @ sums.g.reshape(-1), scale, constraint)
+    n, h = n - rows.T @ flat, h - flat.T @ sums.g.reshape(-1)
+    q, step, pivots = _kept(n, h, scale, constraint)
     steps = jnp.einsum("eij,ej->ei", inverse, sums.g) - by_kept @ step
-    return Solution(step, q, Carried(steps, inverse, by_kept), jnp.concatenate([of_blocks, pivots]))
+    return Solution(n, step, q, Carried(steps, inverse, by_kept), jnp.concatenate([of_blocks, pivots]))
 
 
 def _kept(n: Matrix, h: Vector, scale: Vector, constraint) -> tuple[Matrix, Vector, Float[Array, " some"]]:

@@ -20,12 +20,14 @@ from .terms import Families, Linearised, Steps, Term, closed, linearised, moved,
 class JointAdjustment(eqx.Module):
     """A finished adjustment of blocks of parameters by several terms.
 
-    `parameters`: by the name of their family, as they were given. `cofactor`: of all local parameters of the kept
-    families, in their order. `residuals` (whitened) and `redundancy`: of each term, (group, m). `sigma0` is NaN without
-    a degree of freedom. `pivot`: the least part of the diagonal of a parameter that those before it leave.
+    `parameters`: by the name of their family, as they were given. `normal_matrix` (what is left of it after the
+    elimination) and `cofactor`: of all local parameters of the kept families, in their order. `residuals` (whitened)
+    and `redundancy`: of each term, (group, m). `sigma0` is NaN without a degree of freedom. `pivot`: the least part of
+    the diagonal of a parameter that those before it leave.
     """
 
     parameters: dict[str, PyTree]
+    normal_matrix: Float[Array, "kept kept"]
     cofactor: Float[Array, "kept kept"]
     residuals: tuple[Float[Array, "_ _"], ...]
     redundancy: tuple[Float[Array, "_ _"], ...]
@@ -145,6 +147,7 @@ def _read(joint: Joint, steps: Steps, iterations: Int[Array, ""], converged: Boo
     result = RESULTS.where(pivot < normal.SINGULAR, RESULTS.rank_deficient, result)
     return JointAdjustment(
         parameters={name: moved(joint.families[name], step) for name, step in steps.items()},
+        normal_matrix=weighted.normal_matrix,
         cofactor=solution.cofactor,
         residuals=tuple(part.residuals for part in parts),
         redundancy=tuple(

@@ -14,6 +14,7 @@ from typing import overload
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
@@ -126,6 +127,11 @@ def adjust(
             solver=solver,
             max_steps=max_steps,
         )
+    if eliminate is not None or constraints is not None:
+        raise ValueError("adjust: `eliminate` and `constraints` are for terms; give `Term`s in place of the condition")
+    if as_parameters(start).count > normal.UNROLLED:
+        measured = condition, prepare, observations, cofactor, mask
+        return _of_one_block(*measured, start, loss=loss, solver=solver, max_steps=max_steps)
     groups = jax.tree.leaves(observations)[0].shape[0]
     if mask is None:
         mask = jnp.ones(groups, bool)
@@ -150,6 +156,31 @@ def adjust(
         lambda r: (r.centre, r.loss), residuals, (parameters, None), is_leaf=lambda leaf: leaf is None
     )
     return read(at_solution, loss, solution.stats["num_steps"], converged)
+
+
+def _of_one_block(condition, prepare, observations, cofactor, mask, start, **options) -> Adjustment:
+    """Many parameters, all of which every group touches, as one block."""
+
+    def of_block(parameters, observation):
+        arguments = as_parameters(parameters).arguments()
+        return condition(parameters if prepare is None else prepare(*arguments), observation)
+
+    term = Term(of_block, observations, cofactor, [("all", np.zeros((), int))], mask)
+    found = adjust_jointly((term,), {"all": jax.tree.map(lambda a: jnp.asarray(a)[None], start)}, **options)
+    parameters = as_parameters(jax.tree.map(lambda a: a[0], found.parameters["all"])).normalised()
+    one = lambda a: a[:, 0] if a.shape[1] == 1 else a
+    return Adjustment(
+        parameters=as_given(parameters),
+        normal_matrix=found.normal_matrix,
+        cofactor=found.cofactor,
+        residuals=one(found.residuals[0]),
+        redundancy=one(found.redundancy[0]),
+        sigma0=found.sigma0,
+        pivot=found.pivot,
+        degrees_of_freedom=found.degrees_of_freedom,
+        iterations=found.iterations,
+        result=found.result,
+    )
 
 
 def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged) -> Adjustment:

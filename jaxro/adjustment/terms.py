@@ -10,9 +10,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from .parameters import as_given, as_parameters
+from .parameters import AbstractParameters, as_parameters
 from .residuals import discrepancy, whitened
 
 Families = Mapping[str, Any]
@@ -41,7 +42,7 @@ class Term(eqx.Module):
         condition: Callable,
         observations: PyTree,
         cofactor: PyTree,
-        touches: Sequence[tuple[str, Int[ArrayLike, " group"]]],
+        touches: Sequence[tuple[str, Int[ArrayLike, "..."]]],
         mask: ArrayLike | None = None,
     ):
         self.condition = condition
@@ -85,7 +86,10 @@ def moved(family: Any, steps: Float[Array, "member d"]) -> Any:
 
 
 def _moved(block: Any, step: Float[Array, " d"]) -> Any:
-    return as_given(as_parameters(block).moved(tuple(step[k] for k in range(step.shape[0]))))
+    if isinstance(block, AbstractParameters):
+        return block.moved(tuple(step[k] for k in range(step.shape[0])))
+    flat, unravel = ravel_pytree(block)
+    return unravel(flat + step)
 
 
 def residuals(term: Term, families: Families, steps: Steps) -> Float[Array, "group m"]:
