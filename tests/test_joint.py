@@ -210,6 +210,31 @@ def test_a_bundle_without_control_is_told(bundle):
     assert free.result != RESULTS.successful
 
 
+def test_a_pair_as_one_of_several_terms_is_the_pair():
+    """Elements that move in their own way, as a family of two: two pairs at once are each of them alone."""
+    pairs, _ = jaxro.simulation.random_pairs(jax.random.key(2), 2, 12, focal=100.0)
+    noise = np.random.default_rng(2).normal(0, 0.01, (4, 2, 12))
+    coordinates = [np.asarray(c) + e for c, e in zip(pairs.coordinates, noise, strict=True)]
+    alone = jaxro.orient_batch(jaxro.pair(*coordinates, focal=100.0, sigma=0.01))
+    flat = tuple(c.reshape(-1) for c in coordinates)
+
+    def condition(pose, point):
+        x1, y1, x2, y2 = point
+        rotation, base = pose.relative()
+        left, right = jnp.stack([x1, y1, -100.0]), jnp.stack([jnp.stack(row) for row in rotation])
+        return jnp.dot(jnp.stack(base), jnp.cross(left, right @ jnp.stack([x2, y2, -100.0])))
+
+    term = Term(condition, flat, 1e-4, [("pose", np.repeat(np.arange(2), 12))])
+    start, off = jax.tree.map(lambda a: a[:2], alone.pose), jnp.array([0.02, -0.01, 0.01, 0.02, -0.02])
+    near = jax.vmap(lambda pose: pose.moved(tuple(off)).normalised())(start)
+    found = eqx.filter_jit(adjust)(term, {"pose": near})
+    for one, other in zip(jax.tree.leaves(found.parameters["pose"]), jax.tree.leaves(alone.pose), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+    unit = np.sqrt(np.einsum("kii->ki", np.asarray(alone.cofactor)))
+    unit = unit[:, :, None] * unit[:, None, :]
+    np.testing.assert_allclose(found.cofactors("pose") / unit, alone.cofactor / unit, atol=1e-6)
+
+
 # --------------------------------------------------------------------------------------------------------- the parts
 
 

@@ -14,7 +14,7 @@ from .guarded import root, times
 from .losses import AbstractLoss
 from .m_estimates import spread
 from .results import RESULTS
-from .terms import Families, Linearised, Steps, Term, closed, linearised, moved, residuals
+from .terms import Families, Linearised, Steps, Term, closed, linearised, moved, residuals, standard
 
 
 class JointAdjustment(eqx.Module):
@@ -119,11 +119,13 @@ def adjust_jointly(
         adjoint=optx.ImplicitAdjoint(linear_solver=normal.SmallCholesky()),
         throw=False,
     )
-    return _read(joint, found.value, found.stats["num_steps"], found.result == optx.RESULTS.successful)
+    solved = {name: standard(moved(families[name], step)) for name, step in found.value.items()}
+    at_solution = Joint(terms, solved, layout, constraints, loss)
+    return _read(at_solution, origin, found.stats["num_steps"], found.result == optx.RESULTS.successful)
 
 
 def _read(joint: Joint, steps: Steps, iterations: Int[Array, ""], converged: Bool[Array, ""]) -> JointAdjustment:
-    """Everything that follows from the linearisation at the solution."""
+    """Everything that follows from the linearisation at the solution, from which these steps are none."""
     layout, terms, loss = joint.layout, joint.terms, joint.loss
     parts = joint.linearised(steps)
     weighted = joint.solved(steps, parts, loss)
@@ -146,7 +148,7 @@ def _read(joint: Joint, steps: Steps, iterations: Int[Array, ""], converged: Boo
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)
     result = RESULTS.where(pivot < normal.SINGULAR, RESULTS.rank_deficient, result)
     return JointAdjustment(
-        parameters={name: moved(joint.families[name], step) for name, step in steps.items()},
+        parameters=joint.families,
         normal_matrix=weighted.normal_matrix,
         cofactor=solution.cofactor,
         residuals=tuple(part.residuals for part in parts),

@@ -167,10 +167,9 @@ def _of_one_block(condition, prepare, observations, cofactor, mask, start, **opt
 
     term = Term(of_block, observations, cofactor, [("all", np.zeros((), int))], mask)
     found = adjust_jointly((term,), {"all": jax.tree.map(lambda a: jnp.asarray(a)[None], start)}, **options)
-    parameters = as_parameters(jax.tree.map(lambda a: a[0], found.parameters["all"])).normalised()
     one = lambda a: a[:, 0] if a.shape[1] == 1 else a
     return Adjustment(
-        parameters=as_given(parameters),
+        parameters=jax.tree.map(lambda a: a[0], found.parameters["all"]),
         normal_matrix=found.normal_matrix,
         cofactor=found.cofactor,
         residuals=one(found.residuals[0]),

@@ -85,6 +85,11 @@ def moved(family: Any, steps: Float[Array, "member d"]) -> Any:
     return jax.vmap(_moved)(family, steps)
 
 
+def standard(family: Any) -> Any:
+    """All members of a family in their standard form."""
+    return jax.vmap(lambda block: block.normalised())(family) if isinstance(family, AbstractParameters) else family
+
+
 def _moved(block: Any, step: Float[Array, " d"]) -> Any:
     if isinstance(block, AbstractParameters):
         return block.moved(tuple(step[k] for k in range(step.shape[0])))
