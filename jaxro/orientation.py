@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import chosen_elements, coplanarity, critical_values, degeneracy, planes, starts
+from .adjustment import results as adjusted
 from .adjustment.guarded import root, times
 from .adjustment.least_squares import adjust
 from .adjustment.losses import AbstractLoss
@@ -249,8 +250,11 @@ def _inspected(
     qq, behind = sums((parallax**2, (behind & ~pair.coarse).astype(parallax.dtype)))
     m_q = jnp.where(checked, root(qq / jnp.where(checked, freedom, 1).astype(parallax.dtype)), jnp.nan)
 
-    result = RESULTS.promote(adjustment.result)
-    fair = result == RESULTS.successful
+    ended = adjustment.result
+    fair = ended == adjusted.RESULTS.successful
+    # `promote` would look it up in a table, pair by pair
+    result = RESULTS.where(ended == adjusted.RESULTS.rank_deficient, RESULTS.rank_deficient, RESULTS.diverged)
+    result = RESULTS.where(fair, RESULTS.successful, result)
     worst, worst_chosen = (
         jnp.max(jnp.diagonal(degeneracy.in_radians(of, cofactor)[0]))
         for of, cofactor in ((solved, adjustment.cofactor), (chosen, q))
