@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from . import chosen_elements, coplanarity, critical_values, degeneracy, planes, starts
-from .adjustment import results as adjusted
+from .adjustment import results
 from .adjustment.guarded import root, times
 from .adjustment.least_squares import adjust
 from .adjustment.losses import AbstractLoss
@@ -25,7 +25,7 @@ from .pairs import Coordinates, Pair, cleaned, double
 from .pointwise import pointwise
 from .programs import FAST, QUICK, QUICKEST, Program, loops, traced, whole
 from .reductions import sums
-from .results import RESULTS, is_usable
+from .results import RESULTS, is_usable, of_adjustment
 
 WEAK = 0.04
 """Standard deviation (rad) of a local parameter above which the linearised statistics no longer mean anything."""
@@ -250,11 +250,8 @@ def _inspected(
     qq, behind = sums((parallax**2, (behind & ~pair.coarse).astype(parallax.dtype)))
     m_q = jnp.where(checked, root(qq / jnp.where(checked, freedom, 1).astype(parallax.dtype)), jnp.nan)
 
-    ended = adjustment.result
-    fair = ended == adjusted.RESULTS.successful
-    # `promote` would look it up in a table, pair by pair
-    result = RESULTS.where(ended == adjusted.RESULTS.rank_deficient, RESULTS.rank_deficient, RESULTS.diverged)
-    result = RESULTS.where(fair, RESULTS.successful, result)
+    fair = adjustment.result == results.RESULTS.successful
+    result = of_adjustment(adjustment.result)
     worst, worst_chosen = (
         jnp.max(jnp.diagonal(degeneracy.in_radians(of, cofactor)[0]))
         for of, cofactor in ((solved, adjustment.cofactor), (chosen, q))

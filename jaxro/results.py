@@ -53,6 +53,14 @@ class RESULTS(results.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
+def of_adjustment(result: results.RESULTS) -> RESULTS:
+    """What the end of an adjustment means for an orientation; `RESULTS.promote` would look it up, pair by pair."""
+    undetermined = result == results.RESULTS.rank_deficient
+    failed = RESULTS.where(undetermined, RESULTS.rank_deficient, RESULTS.diverged)  # pyright: ignore[reportArgumentType]
+    right = result == results.RESULTS.successful
+    return RESULTS.where(right, RESULTS.successful, failed)  # pyright: ignore[reportArgumentType]
+
+
 def is_usable(result: RESULTS) -> Bool[Array, "..."]:
     """True where the elements may be used: successful, no_redundancy or two_solutions (with their warnings)."""
     return (

@@ -264,6 +264,13 @@ def test_what_cannot_be_adjusted_is_told(net, start, eliminate, said):
         adjust([legs(net)], start, eliminate=eliminate)
 
 
+def test_a_member_that_is_not_there_is_told():
+    """JAX itself would take the last one."""
+    beyond = Term(lambda height, known: height - known, np.array([1.5]), 0.01, [("height", np.array([3]))])
+    with pytest.raises(ValueError, match="not there"):
+        adjust(beyond, {"height": jnp.zeros(3)})
+
+
 def test_the_engine_knows_no_photo():
     """Its imports stay within it and the compiler's seam, and it asks for no kind of elements."""
     import ast

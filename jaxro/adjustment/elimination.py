@@ -12,9 +12,11 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax.ops import segment_sum
 from jaxtyping import Array, Float, Int
 
+from ..programs import traced
 from . import normal_equations as normal, symmetric
 from .terms import Families, Linearised, Term, dimension, members
 
@@ -85,6 +87,9 @@ def layout(families: Families, terms: tuple[Term, ...], eliminate: str | None) -
     if idle := set(families) - touched:
         raise ValueError(f"adjust: no condition touches the parameters {sorted(idle)}")
     for term in terms:
+        for name, member in term.touches:
+            if not traced(member) and not np.all(np.isin(member, np.arange(members(families[name])))):
+                raise ValueError(f"adjust: a condition touches a member of {name!r} that is not there")
         if sum(name == eliminate for name, _ in term.touches) > 1:
             raise ValueError(f"adjust: a condition joins two blocks of {eliminate!r}, which cannot be eliminated then")
     if set(families) == {eliminate}:

@@ -110,15 +110,7 @@ def adjust_jointly(
     terms = tuple(closed(term, families) for term in terms)
     joint = Joint(terms, families, layout, constraints, loss)
     origin = {block.name: jnp.zeros((block.members, block.size), float) for block in layout.blocks}
-    found = optx.least_squares(
-        lambda steps, joint: joint(steps),
-        normal.GaussNewton() if solver is None else solver,
-        origin,
-        args=joint,
-        max_steps=max_steps,
-        adjoint=optx.ImplicitAdjoint(linear_solver=normal.SmallCholesky()),
-        throw=False,
-    )
+    found = normal.minimise(joint, origin, solver, max_steps)
     solved = {name: standard(moved(families[name], step)) for name, step in found.value.items()}
     at_solution = Joint(terms, solved, layout, constraints, loss)
     return _read(at_solution, origin, found.stats["num_steps"], found.result == optx.RESULTS.successful)

@@ -117,6 +117,8 @@ def adjust(
     `constraints(parameters)`: numbers of the kept families that are to become zero, as the datum of a free network.
     """
     if isinstance(condition, Term | Sequence):
+        if any(given is not None for given in (observations, cofactor, mask, prepare)):
+            raise ValueError("adjust: observations, cofactors and masks are part of each `Term`; there is no `prepare`")
         terms = (condition,) if isinstance(condition, Term) else tuple(condition)
         return adjust_jointly(
             terms,
@@ -140,15 +142,7 @@ def adjust(
     start = as_parameters(jax.lax.stop_gradient(start))  # the optimum does not depend on where it is sought
     residuals = residuals_of(condition, prepare, start, observations, cofactor, mask, loss)
     origin = (jnp.zeros((), dtype),) * start.count
-    solve = lambda origin, residuals: optx.least_squares(
-        lambda x, residuals: residuals(x),
-        normal.GaussNewton() if solver is None else solver,
-        origin,
-        args=residuals,
-        max_steps=max_steps,
-        adjoint=optx.ImplicitAdjoint(linear_solver=normal.SmallCholesky()),
-        throw=False,
-    )
+    solve = lambda origin, residuals: normal.minimise(residuals, origin, solver, max_steps)
     solution = part(solve)(origin, residuals)
     parameters = start.moved(solution.value).normalised()
     converged = solution.result == optx.RESULTS.successful

@@ -270,6 +270,19 @@ class SmallCholesky(lx.AbstractLinearSolver):
         return True
 
 
+def minimise(residuals: Any, origin: PyTree, solver: optx.AbstractLeastSquaresSolver | None, max_steps: int) -> Any:
+    """The optimistix solution for `residuals.Residuals` or `joint.Joint`, differentiable by all that these hold."""
+    return optx.least_squares(
+        lambda x, residuals: residuals(x),
+        GaussNewton() if solver is None else solver,
+        origin,
+        args=residuals,
+        max_steps=max_steps,
+        adjoint=optx.ImplicitAdjoint(linear_solver=SmallCholesky()),
+        throw=False,
+    )
+
+
 def steps(residuals: Any, x: tuple[Scalar, ...], count: int, max_step: float) -> tuple[Scalar, ...]:
     """A fixed number of Gauss-Newton steps on `residuals.Residuals`, for starts that need no convergence test."""
     solver = GaussNewton(max_step=max_step)
