@@ -20,13 +20,16 @@ Poses = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Size:
-    """How much is measured: pairs by number of points, the share of them the slower peers get, repeats.
+    """How much is measured: pairs by number of points, the share of them the slower
+    peers get, repeats.
 
-    `robust`: what multiplies the numbers of pairs of the robust suites. `trials`: of the comparison of procedures.
-    `rows`: of large tables.
+    `robust`: what multiplies the numbers of pairs of the robust suites. `trials`: of
+    the comparison of procedures. `rows`: of large tables.
     """
 
-    pairs: dict[int, int] = field(default_factory=lambda: {16: 131_072, 200: 16_384, 1000: 4_096})
+    pairs: dict[int, int] = field(
+        default_factory=lambda: {16: 131_072, 200: 16_384, 1000: 4_096}
+    )
     peer_share: int = 4
     repeats: int = 7
     processes: int = 5
@@ -62,20 +65,30 @@ def ready(call: Callable, *arguments: Any) -> Any:
 
 def poses(pose: jaxro.RelativePose) -> Poses:
     rotation, base = pose.relative()
-    return np.moveaxis(np.array(rotation), (0, 1), (-2, -1)), np.moveaxis(np.array(base), 0, -1)
+    return np.moveaxis(np.array(rotation), (0, 1), (-2, -1)), np.moveaxis(
+        np.array(base), 0, -1
+    )
 
 
 def difference(one: Poses, other: Poses) -> float:
-    """The largest difference of any entry of R or of the unit base: radians, for small ones."""
+    """The largest difference of any entry of R or of the unit base: radians, for small
+    ones."""
     count = min(len(one[0]), len(other[0]))
-    return max(float(np.max(np.abs(a[:count] - b[:count]))) for a, b in zip(one, other, strict=True))
+    return max(
+        float(np.max(np.abs(a[:count] - b[:count])))
+        for a, b in zip(one, other, strict=True)
+    )
 
 
 def agreement(key: str, ours: Poses, theirs: Poses, bound: float) -> Metric:
-    """The metric of an accuracy comparison. Raises ArithmeticError beyond `bound`: nothing is timed then."""
+    """The metric of an accuracy comparison. Raises ArithmeticError beyond `bound`:
+    nothing is timed then."""
     found = difference(ours, theirs)
     if not found <= bound:
-        raise ArithmeticError(f"{key}: the answers differ by {found:.1e}, more than {bound:.0e}; nothing timed")
+        raise ArithmeticError(
+            f"{key}: the answers differ by {found:.1e}, more than {bound:.0e}; nothing "
+            "timed"
+        )
     return Metric(key, found, "rad", "lower", tolerance=np.inf, goal=bound)
 
 
@@ -93,6 +106,7 @@ def pose(orientation: jaxro.Orientation) -> jaxro.RelativePose:
 
 
 def listed(orientation: jaxro.Orientation) -> tuple:
-    """What makes an orientation whole: the pose, covariance, residuals, redundancy numbers and model points."""
+    """What makes an orientation whole: the pose, covariance, residuals, redundancy
+    numbers and model points."""
     o = orientation
     return o.pose, o.covariance, o.residuals, o.redundancy, o.model

@@ -1,4 +1,5 @@
-"""A benchmark is a contract: what was measured, what is promised, how far it may slip."""
+"""A benchmark is a contract: what was measured, what is promised, how far it may
+slip."""
 
 import re
 import statistics
@@ -14,7 +15,8 @@ START, END = "<!-- measured -->", "<!-- end of measured -->"
 
 @dataclass(frozen=True)
 class Metric:
-    """One measured figure. `tolerance` is the share by which it may be worse than the committed one."""
+    """One measured figure. `tolerance` is the share by which it may be worse than the
+    committed one."""
 
     key: str
     value: float
@@ -30,7 +32,9 @@ class Metric:
 
     def reaches(self, bound: float) -> bool:
         """Whether the value is at least as good as `bound`."""
-        return self.value >= bound if self.direction == "higher" else self.value <= bound
+        return (
+            self.value >= bound if self.direction == "higher" else self.value <= bound
+        )
 
     def held_against(self, committed: float) -> bool:
         """Whether the value is within the tolerance of the committed one."""
@@ -39,32 +43,54 @@ class Metric:
 
     def row(self) -> str:
         """The line of the results table."""
-        goal = "" if self.goal is None else f"{'>=' if self.direction == 'higher' else '<='} {self.goal:g}"
-        verdict = "" if self.goal is None else ("yes" if self.reaches(self.goal) else "**no**")
-        return f"| {self.key} | {self.value:.4g} | {self.unit} | {self.direction} | {goal} | {verdict} |"
+        goal = (
+            ""
+            if self.goal is None
+            else f"{'>=' if self.direction == 'higher' else '<='} {self.goal:g}"
+        )
+        verdict = (
+            ""
+            if self.goal is None
+            else ("yes" if self.reaches(self.goal) else "**no**")
+        )
+        return (
+            f"| {self.key} | {self.value:.4g} | {self.unit} | {self.direction} | "
+            f"{goal} | {verdict} |"
+        )
 
 
 def table(metrics: Iterable[Metric]) -> str:
     """All metrics as a Markdown table."""
-    head = "| metric | value | unit | better | goal | reached |\n|---|---|---|---|---|---|"
+    head = (
+        "| metric | value | unit | better | goal | reached |\n|---|---|---|---|---|---|"
+    )
     return "\n".join([head, *(metric.row() for metric in metrics)])
 
 
 def committed() -> dict[str, float]:
     """key -> value of the table in results.md."""
     text = RESULTS.read_text() if RESULTS.exists() else ""
-    rows = re.findall(r"^\| (.+?) \| (\S+) \|", text.partition(START)[2].partition(END)[0], re.MULTILINE)
+    rows = re.findall(
+        r"^\| (.+?) \| (\S+) \|",
+        text.partition(START)[2].partition(END)[0],
+        re.MULTILINE,
+    )
     return {key: float(value) for key, value in rows if key not in ("metric", "---")}
 
 
 def write(metrics: Iterable[Metric], machine: str) -> None:
     """Puts the table between the markers of results.md; the text around them stays."""
     before, _, rest = RESULTS.read_text().partition(START)
-    RESULTS.write_text(f"{before}{START}\n{machine}\n\n{table(metrics)}\n{END}{rest.partition(END)[2]}")
+    RESULTS.write_text(
+        f"{before}{START}\n{machine}\n\n{table(metrics)}\n{END}{rest.partition(END)[2]}"
+    )
 
 
-def median_seconds(contestants: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Median wall time of each call; the contestants take turns, so that a disturbance meets all of them."""
+def median_seconds(
+    contestants: Mapping[str, Callable[[], object]], repeats: int
+) -> dict[str, float]:
+    """Median wall time of each call; the contestants take turns, so that a disturbance
+    meets all of them."""
     times: dict[str, list[float]] = {name: [] for name in contestants}
     for _ in range(repeats):
         for name, call in contestants.items():

@@ -1,7 +1,8 @@
-"""Simulated pairs with known truth: photographs, target fields, and points in any position. NumPy alone.
+"""Simulated pairs with known truth: photographs, target fields, and points in any
+position. NumPy alone.
 
-Conventions are those of the package: a point is λ p1 seen from the left and B + μ R p2 seen from the right, where
-p = (x, y, -f) and y points up; the base has length 1.
+Conventions are those of the package: a point is λ p1 seen from the left and B + μ R p2
+seen from the right, where p = (x, y, -f) and y points up; the base has length 1.
 """
 
 from typing import Any, NamedTuple
@@ -13,26 +14,31 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 TAIL, SPREAD, AGREEING = 0.08, 3.0, 0.3
-"""Photographs: share of true matches with larger noise, how many times larger, share of the variance in common with
-neighbours."""
+"""Photographs: share of true matches with larger noise, how many times larger, share of
+the variance in common with neighbours."""
 BULK = 1.057
-"""Median of such noise over that of normal noise: divided by it, 1.48 times the median distance is sigma."""
+"""Median of such noise over that of normal noise: divided by it, 1.48 times the median
+distance is sigma."""
 REPEATED = 0.05
 """Share of true matches that are found twice at the same place."""
 UNDECIDABLE = 3.0
-"""A wrong match within so many sigma of its true epipolar line cannot be told from a right one by any pose."""
+"""A wrong match within so many sigma of its true epipolar line cannot be told from a
+right one by any pose."""
 
 BASES = ("forward", "sideways", "turned", "wide")
 FIELDS = ("wall", "planes", "corner")
 
 
 class Scenes(NamedTuple):
-    """Pairs of equal length: coordinates (pair, point) relative to the principal point, in the unit of `focal`.
+    """Pairs of equal length: coordinates (pair, point) relative to the principal point,
+    in the unit of `focal`.
 
-    `there`: which points exist (target fields differ in length; coordinates of others are zero). `good`: true matches.
-    `undecidable`: wrong matches that agree with the true pose by chance or along the epipolar line; keeping them is
-    neither right nor wrong. `rotation`, `base`: the truth; it means nothing where `common` is false: no common view.
-    `sigma`: of a coordinate; for photographs, 1.48 times the median of its errors.
+    `there`: which points exist (target fields differ in length; coordinates of others
+    are zero). `good`: true matches. `undecidable`: wrong matches that agree with the
+    true pose by chance or along the epipolar line; keeping them is neither right nor
+    wrong. `rotation`, `base`: the truth; it means nothing where `common` is false: no
+    common view. `sigma`: of a coordinate; for photographs, 1.48 times the median of its
+    errors.
     """
 
     x_left: Array
@@ -63,7 +69,8 @@ def joined(parts: list[Scenes]) -> Scenes:
     return Scenes(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
-# ---------------------------------------------------------------------------------------------------------- geometry
+# ------------------------------------------------------------------------------------
+# geometry
 
 
 def turn(axis: Array, angle: float) -> Array:
@@ -80,7 +87,8 @@ def direction(rng: np.random.Generator) -> Array:
 
 
 def looking(towards: Array, roll: float) -> Array:
-    """Camera to space: the axis (0, 0, -1) looks along `towards`, then the photo is rolled about its axis."""
+    """Camera to space: the axis (0, 0, -1) looks along `towards`, then the photo is
+    rolled about its axis."""
     z = -towards / np.linalg.norm(towards)
     x = np.cross([0.0, 1.0, 0.0], z)
     x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-6 else np.array([1.0, 0.0, 0.0])
@@ -88,8 +96,11 @@ def looking(towards: Array, roll: float) -> Array:
     return frame @ turn(np.array([0.0, 0.0, 1.0]), roll)
 
 
-def project(space: Array, rotation: Array, station: Array, focal: float) -> tuple[Array, Mask]:
-    """Photo coordinates (point, 2) of points of space, and which of them are in front."""
+def project(
+    space: Array, rotation: Array, station: Array, focal: float
+) -> tuple[Array, Mask]:
+    """Photo coordinates (point, 2) of points of space, and which of them are in
+    front."""
     seen = (space - station) @ rotation
     front = seen[:, 2] < -1e-6
     return -focal * seen[:, :2] / np.where(front, seen[:, 2], -1.0)[:, None], front
@@ -100,18 +111,24 @@ def rays(photo: Array, focal: float) -> Array:
     return np.concatenate([photo, np.full((*photo.shape[:-1], 1), -focal)], axis=-1)
 
 
-def sampson(left: Array, right: Array, focal: float, rotation: Array, base: Array) -> Array:
-    """First-order distance of every match (point, 2) from the coplanarity of rays and base, as an error of one
-    coordinate: p1 · E p2 over the root of its variance, E = [B]× R."""
+def sampson(
+    left: Array, right: Array, focal: float, rotation: Array, base: Array
+) -> Array:
+    """First-order distance of every match (point, 2) from the coplanarity of rays and
+    base, as an error of one coordinate: p1 · E p2 over the root of its variance, E =
+    [B]× R."""
     x, y, z = base
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
     p1, p2 = rays(left, focal), rays(right, focal)
     line_left, line_right = p2 @ essential.T, p1 @ essential
     condition = np.sum(p1 * line_left, axis=1)
-    return condition / np.sqrt(np.sum(line_left[:, :2] ** 2, axis=1) + np.sum(line_right[:, :2] ** 2, axis=1))
+    return condition / np.sqrt(
+        np.sum(line_left[:, :2] ** 2, axis=1) + np.sum(line_right[:, :2] ** 2, axis=1)
+    )
 
 
-# ------------------------------------------------------------------------------------------------------- photographs
+# ------------------------------------------------------------------------------------
+# photographs
 
 
 class Photo(NamedTuple):
@@ -145,7 +162,13 @@ def placed(rng: np.random.Generator, kind: str) -> tuple[Array, Array, float]:
     jitter = turn(direction(rng), rng.uniform(0, np.deg2rad(12)))
     if kind == "forward":
         tilt, around = np.deg2rad(30) * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
-        base = np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), -np.cos(tilt)])
+        base = np.array(
+            [
+                np.sin(tilt) * np.cos(around),
+                np.sin(tilt) * np.sin(around),
+                -np.cos(tilt),
+            ]
+        )
         base, distance = base * rng.choice([-1, 1]), rng.uniform(3, 8)
         rotation = jitter @ looking(np.array([0, 0, -1.0]), roll)
     elif kind == "sideways":
@@ -153,25 +176,38 @@ def placed(rng: np.random.Generator, kind: str) -> tuple[Array, Array, float]:
         rotation = jitter @ looking(np.array([0, 0, -1.0]), roll)
     elif kind == "turned":
         base, distance = sideways, rng.uniform(2, 8)
-        quarter = rng.choice([0, np.pi / 2, -np.pi / 2, np.pi]) + rng.uniform(-small, small)
+        quarter = rng.choice([0, np.pi / 2, -np.pi / 2, np.pi]) + rng.uniform(
+            -small, small
+        )
         roll = quarter if rng.random() < 0.5 else rng.uniform(-np.pi, np.pi)
         jitter = turn(direction(rng), rng.uniform(0, np.deg2rad(25)))
         rotation = jitter @ looking(np.array([0, 0, -1.0]), roll)
     else:  # wide: the second photo looks back to the same place from 30 to 60° beside
         base, distance = sideways, rng.uniform(0.8, 1.8)
         aim = np.array([0, 0, -distance]) - sideways / np.linalg.norm(sideways)
-        rotation = turn(direction(rng), rng.uniform(0, np.deg2rad(6))) @ looking(aim, rng.uniform(-0.5, 0.5))
+        rotation = turn(direction(rng), rng.uniform(0, np.deg2rad(6))) @ looking(
+            aim, rng.uniform(-0.5, 0.5)
+        )
     return rotation, base / np.linalg.norm(base), distance
 
 
-def depths(rng: np.random.Generator, photo: Array, focal: float, distance: float) -> Array:
-    """Depth of every point of the left photo, for a scene of random kind: layers, one or two facades, clutter."""
+def depths(
+    rng: np.random.Generator, photo: Array, focal: float, distance: float
+) -> Array:
+    """Depth of every point of the left photo, for a scene of random kind: layers, one
+    or two facades, clutter."""
     ray = rays(photo, focal) / focal
     count = len(photo)
 
     def plane(least: float, most: float) -> Array:
         slope, around = np.deg2rad(rng.uniform(0, 55)), rng.uniform(0, 2 * np.pi)
-        normal = np.array([np.sin(slope) * np.cos(around), np.sin(slope) * np.sin(around), np.cos(slope)])
+        normal = np.array(
+            [
+                np.sin(slope) * np.cos(around),
+                np.sin(slope) * np.sin(around),
+                np.cos(slope),
+            ]
+        )
         scale = -(ray @ normal)
         depth = distance * rng.uniform(least, most) * normal[2] / np.maximum(scale, 0.1)
         return depth * (1 + rng.uniform(0.005, 0.04) * rng.uniform(-1, 1, count))
@@ -189,57 +225,94 @@ def depths(rng: np.random.Generator, photo: Array, focal: float, distance: float
     return distance / rng.uniform(0.25, 1.8, count)
 
 
-def agreeing(rng: np.random.Generator, photo: Array, width: float, waves: int = 40) -> Array:
-    """A smooth random field of variance 1 at every point, (point, 2): errors that neighbouring keypoints share."""
+def agreeing(
+    rng: np.random.Generator, photo: Array, width: float, waves: int = 40
+) -> Array:
+    """A smooth random field of variance 1 at every point, (point, 2): errors that
+    neighbouring keypoints share."""
     number = rng.normal(0, 1 / (0.1 * width), (waves, 2))
     phase = rng.uniform(0, 2 * np.pi, (2, waves))
-    return np.stack([np.sum(np.cos(photo @ number.T + p), axis=1) for p in phase], axis=1) * np.sqrt(2 / waves)
+    return np.stack(
+        [np.sum(np.cos(photo @ number.T + p), axis=1) for p in phase], axis=1
+    ) * np.sqrt(2 / waves)
 
 
-def noise(rng: np.random.Generator, left: Array, right: Array, photo: Photo, sigma: float) -> tuple[Array, Array]:
+def noise(
+    rng: np.random.Generator, left: Array, right: Array, photo: Photo, sigma: float
+) -> tuple[Array, Array]:
     """The photos with noise of heavy tails, a part of which neighbours share."""
     larger = np.where(rng.random(len(left)) < TAIL, SPREAD, 1.0)[:, None]
     own, common = np.sqrt(1 - AGREEING), np.sqrt(AGREEING)
     left, right = (
-        p + sigma / BULK * (own * larger * rng.normal(size=p.shape) + common * agreeing(rng, p, photo.width))
+        p
+        + sigma
+        / BULK
+        * (
+            own * larger * rng.normal(size=p.shape)
+            + common * agreeing(rng, p, photo.width)
+        )
         for p in (left, right)
     )
     return left, right
 
 
 def windows(rng: np.random.Generator, photo: Photo, count: int) -> tuple[Array, Array]:
-    """Matches between two window grids that only look alike: of each photo a small piece, a grid seen obliquely."""
+    """Matches between two window grids that only look alike: of each photo a small
+    piece, a grid seen obliquely."""
     columns = max(2, int(np.ceil(np.sqrt(count))))
-    grid = np.stack(np.divmod(np.arange(count), columns)[::-1], axis=1) - (columns - 1) / 2
+    grid = (
+        np.stack(np.divmod(np.arange(count), columns)[::-1], axis=1) - (columns - 1) / 2
+    )
     sides = []
     for _ in range(2):
         step = rng.uniform(0.03, 0.08) * photo.width
         shear = np.eye(2) + rng.uniform(-0.2, 0.2, (2, 2))
         middle = photo.uniform(rng, 1) * 0.7
         piece = grid @ shear.T * step
-        sides.append(middle + piece / (1 + piece @ rng.uniform(-0.1, 0.1, 2)[:, None] / photo.width))
+        sides.append(
+            middle
+            + piece / (1 + piece @ rng.uniform(-0.1, 0.1, 2)[:, None] / photo.width)
+        )
     return sides[0], sides[1]
 
 
 def photographs(
-    pairs: int, points: int, wrong: float, kind: str | None = None, *, common: bool = True, seed: int = 0
+    pairs: int,
+    points: int,
+    wrong: float,
+    kind: str | None = None,
+    *,
+    common: bool = True,
+    seed: int = 0,
 ) -> Scenes:
-    """Pairs of photographs, `wrong` of their matches wrong; of one kind of base (`BASES`), or of all in turn.
+    """Pairs of photographs, `wrong` of their matches wrong; of one kind of base
+    (`BASES`), or of all in turn.
 
-    Of the wrong matches about 70 % lie anywhere, 15 % on the true epipolar line at another depth, 15 % belong to one
-    to three groups of repeated structure: a piece of the scene moved by one and the same step. Without a `common` view
-    all are wrong: anywhere, but for one to three groups of 4 to 12 windows that agree among themselves.
+    Of the wrong matches about 70 % lie anywhere, 15 % on the true epipolar line at
+    another depth, 15 % belong to one to three groups of repeated structure: a piece of
+    the scene moved by one and the same step. Without a `common` view all are wrong:
+    anywhere, but for one to three groups of 4 to 12 windows that agree among
+    themselves.
     """
     make = _photographed if common else _unrelated
     parts = []
     for number in range(pairs):
         own = kind or BASES[number % len(BASES)]
-        rng = np.random.default_rng([seed, number, points, round(1000 * wrong), int(common), BASES.index(own)])
+        rng = np.random.default_rng(
+            [seed, number, points, round(1000 * wrong), int(common), BASES.index(own)]
+        )
         parts.append(make(rng, points, wrong, own))
-    return Scenes(*(np.stack([np.asarray(v) for v in field]) for field in zip(*parts, strict=True)))
+    return Scenes(
+        *(
+            np.stack([np.asarray(v) for v in field])
+            for field in zip(*parts, strict=True)
+        )
+    )
 
 
-def _photographed(rng: np.random.Generator, points: int, wrong: float, kind: str) -> tuple:
+def _photographed(
+    rng: np.random.Generator, points: int, wrong: float, kind: str
+) -> tuple:
     good = points - round(wrong * points)
     sigma = rng.uniform(0.3, 1.0)
     while True:  # until enough of the scene is seen in both photos
@@ -265,7 +338,8 @@ def _photographed(rng: np.random.Generator, points: int, wrong: float, kind: str
     along, grouped = (round(0.15 * (points - good)),) * 2
     one = np.array(left[rest])
     other = photo.uniform(rng, points - good)
-    # the partner is another window or twig on the same epipolar line: the point at another depth
+    # the partner is another window or twig on the same epipolar line: the point at
+    # another depth
     for k in range(along):
         for _ in range(20):
             elsewhere = space[rest][k] * np.exp(rng.uniform(np.log(0.4), np.log(2.5)))
@@ -279,18 +353,40 @@ def _photographed(rng: np.random.Generator, points: int, wrong: float, kind: str
         if len(members):
             middle = left[rng.integers(len(left))]
             near = np.argsort(np.sum((left - middle) ** 2, axis=1))[: len(members)]
-            step = np.array([*rng.choice([-2, -1, 0, 1, 2], 2), 0.0]) * rng.uniform(0.03, 0.08)
+            step = np.array([*rng.choice([-2, -1, 0, 1, 2], 2), 0.0]) * rng.uniform(
+                0.03, 0.08
+            )
             step[rng.integers(2)] += rng.choice([-1, 1]) * 0.05
-            at, front = project(space[near] + step * depth[near].mean(), rotation, base, photo.focal)
-            one[members], other[members] = left[near], np.where(front[:, None], at, other[members])
+            at, front = project(
+                space[near] + step * depth[near].mean(), rotation, base, photo.focal
+            )
+            one[members], other[members] = (
+                left[near],
+                np.where(front[:, None], at, other[members]),
+            )
     one[along + grouped :] = photo.uniform(rng, len(one) - along - grouped)
     one, other = noisy(one, other)
-    left, right = (np.concatenate(both) for both in zip(true, (one, other), strict=True))
+    left, right = (
+        np.concatenate(both) for both in zip(true, (one, other), strict=True)
+    )
     order = rng.permutation(points)
     left, right, is_good = left[order], right[order], order < good
-    close = np.abs(sampson(left, right, photo.focal, rotation, base)) <= UNDECIDABLE * sigma
+    close = (
+        np.abs(sampson(left, right, photo.focal, rotation, base)) <= UNDECIDABLE * sigma
+    )
     there = np.ones(points, bool)
-    return *left.T, *right.T, there, is_good, ~is_good & close, photo.focal, sigma, rotation, base, True
+    return (
+        *left.T,
+        *right.T,
+        there,
+        is_good,
+        ~is_good & close,
+        photo.focal,
+        sigma,
+        rotation,
+        base,
+        True,
+    )
 
 
 def _unrelated(rng: np.random.Generator, points: int, wrong: float, kind: str) -> tuple:
@@ -299,15 +395,29 @@ def _unrelated(rng: np.random.Generator, points: int, wrong: float, kind: str) -
     begin = 0
     for _ in range(rng.integers(1, 4)):
         count = int(rng.integers(4, 13))
-        left[begin : begin + count], right[begin : begin + count] = windows(rng, photo, count)
+        left[begin : begin + count], right[begin : begin + count] = windows(
+            rng, photo, count
+        )
         begin += count
     left, right = noise(rng, left, right, photo, sigma)
     order, none = rng.permutation(points), np.zeros(points, bool)
     left, right = left[order], right[order]
-    return *left.T, *right.T, ~none, none, none, photo.focal, sigma, np.eye(3), np.array([1.0, 0, 0]), False
+    return (
+        *left.T,
+        *right.T,
+        ~none,
+        none,
+        none,
+        photo.focal,
+        sigma,
+        np.eye(3),
+        np.array([1.0, 0, 0]),
+        False,
+    )
 
 
-# ----------------------------------------------------------------------------------------------------- target fields
+# ------------------------------------------------------------------------------------
+# target fields
 
 TARGET_FOCAL = 28.8
 TARGET_SIGMA = TARGET_FOCAL / 72_000
@@ -317,22 +427,32 @@ MOST_TARGETS = 120
 
 
 def target_fields(pairs: int, kind: str | None = None, *, seed: int = 0) -> Scenes:
-    """Photos of regular target fields, as in an industrial network: 20 to 120 targets, no wrong one, in mm.
+    """Photos of regular target fields, as in an industrial network: 20 to 120 targets,
+    no wrong one, in mm.
 
-    Kinds (`FIELDS`, or all in turn): a wall with some targets on pedestals, several parallel or tilted boards, a corner
-    of two or three walls. Photos convergent and rolled, in any position that sees at least 20 targets in common.
+    Kinds (`FIELDS`, or all in turn): a wall with some targets on pedestals, several
+    parallel or tilted boards, a corner of two or three walls. Photos convergent and
+    rolled, in any position that sees at least 20 targets in common.
     """
     parts = []
     for number in range(pairs):
         rng = np.random.default_rng([seed, number])
         parts.append(_targets(rng, kind or FIELDS[number % len(FIELDS)]))
-    return Scenes(*(np.stack([np.asarray(v) for v in field]) for field in zip(*parts, strict=True)))
+    return Scenes(
+        *(
+            np.stack([np.asarray(v) for v in field])
+            for field in zip(*parts, strict=True)
+        )
+    )
 
 
 def _grid(rng: np.random.Generator, least: int, most: int) -> Array:
     """A regular grid of side about 1 in the plane z = 0."""
     columns, rows = rng.integers(least, most + 1, 2)
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, columns), np.linspace(-0.5, 0.5, rows) * rng.uniform(0.6, 1.0))
+    x, y = np.meshgrid(
+        np.linspace(-0.5, 0.5, columns),
+        np.linspace(-0.5, 0.5, rows) * rng.uniform(0.6, 1.0),
+    )
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
 
@@ -345,12 +465,16 @@ def _field(rng: np.random.Generator, kind: str) -> Array:
     if kind == "planes":
         boards = []
         for _ in range(rng.integers(2, 5)):
-            tilt = turn(direction(rng), rng.uniform(0, np.deg2rad(40)) * rng.integers(2))
+            tilt = turn(
+                direction(rng), rng.uniform(0, np.deg2rad(40)) * rng.integers(2)
+            )
             boards.append(0.5 * _grid(rng, 3, 6) @ tilt.T + rng.uniform(-0.5, 0.5, 3))
         return np.concatenate(boards)
     first, second, third = _grid(rng, 4, 7), _grid(rng, 4, 7), _grid(rng, 4, 7)
     walls = [first, second[:, [2, 1, 0]] + (-0.5, 0, 0.5)]
-    return np.concatenate([*walls, third[:, [0, 2, 1]] + (0, -0.5, 0.5)] if rng.random() < 0.5 else walls)
+    return np.concatenate(
+        [*walls, third[:, [0, 2, 1]] + (0, -0.5, 0.5)] if rng.random() < 0.5 else walls
+    )
 
 
 def _targets(rng: np.random.Generator, kind: str) -> tuple:
@@ -358,15 +482,27 @@ def _targets(rng: np.random.Generator, kind: str) -> tuple:
         space = _field(rng, kind)
         stations, turns = [], []
         for _ in range(2):
-            slope, around = np.arccos(rng.uniform(np.cos(np.deg2rad(55)), 1)), rng.uniform(0, 2 * np.pi)
-            away = np.array([np.sin(slope) * np.cos(around), np.sin(slope) * np.sin(around), np.cos(slope)])
+            slope, around = (
+                np.arccos(rng.uniform(np.cos(np.deg2rad(55)), 1)),
+                rng.uniform(0, 2 * np.pi),
+            )
+            away = np.array(
+                [
+                    np.sin(slope) * np.cos(around),
+                    np.sin(slope) * np.sin(around),
+                    np.cos(slope),
+                ]
+            )
             station = away * rng.uniform(0.9, 2.5)
             aim = rng.uniform(-0.15, 0.15, 3) - station
             stations.append(station)
             turns.append(looking(aim, rng.uniform(-np.pi, np.pi)))
         base = stations[1] - stations[0]
         length = np.linalg.norm(base)
-        photos = [project(space, r, s, TARGET_FOCAL) for r, s in zip(turns, stations, strict=True)]
+        photos = [
+            project(space, r, s, TARGET_FOCAL)
+            for r, s in zip(turns, stations, strict=True)
+        ]
         seen = np.all([front & FORMAT.holds(photo) for photo, front in photos], axis=0)
         if np.sum(seen) >= 20 and length > 0.3:
             break
@@ -374,28 +510,48 @@ def _targets(rng: np.random.Generator, kind: str) -> tuple:
     there = np.arange(MOST_TARGETS) < len(chosen)
     padded = np.zeros((2, MOST_TARGETS, 2))
     for side, (photo, _) in zip(padded, photos, strict=True):
-        side[: len(chosen)] = photo[chosen] + rng.normal(0, TARGET_SIGMA, (len(chosen), 2))
+        side[: len(chosen)] = photo[chosen] + rng.normal(
+            0, TARGET_SIGMA, (len(chosen), 2)
+        )
     rotation, direction_ = turns[0].T @ turns[1], turns[0].T @ base / length
     none = np.zeros(MOST_TARGETS, bool)
-    return *padded[0].T, *padded[1].T, there, there, none, TARGET_FOCAL, TARGET_SIGMA, rotation, direction_, True
+    return (
+        *padded[0].T,
+        *padded[1].T,
+        there,
+        there,
+        none,
+        TARGET_FOCAL,
+        TARGET_SIGMA,
+        rotation,
+        direction_,
+        True,
+    )
 
 
-# ------------------------------------------------------------------------------------------------------ any position
+# ------------------------------------------------------------------------------------
+# any position
 
 PLAIN_FOCAL, PLAIN_SIGMA, PLAIN_HALF = 2000.0, 0.5, 2000.0
 
 
 def any_position(pairs: int, points: int, wrong: float, *, seed: int = 0) -> Scenes:
-    """Points in a random volume of space, photos in any position, normal noise, wrong partners anywhere; px.
+    """Points in a random volume of space, photos in any position, normal noise, wrong
+    partners anywhere; px.
 
-    The points fill a ball of radius r seen from distances of 1.2 to 3 r, the base in any direction, the right photo
-    looks at the ball and is rolled by any angle.
+    The points fill a ball of radius r seen from distances of 1.2 to 3 r, the base in
+    any direction, the right photo looks at the ball and is rolled by any angle.
     """
     parts = []
     for number in range(pairs):
         rng = np.random.default_rng([seed, number, points, round(1000 * wrong)])
         parts.append(_plain(rng, points, wrong))
-    return Scenes(*(np.stack([np.asarray(v) for v in field]) for field in zip(*parts, strict=True)))
+    return Scenes(
+        *(
+            np.stack([np.asarray(v) for v in field])
+            for field in zip(*parts, strict=True)
+        )
+    )
 
 
 def _plain(rng: np.random.Generator, points: int, wrong: float) -> tuple:
@@ -405,20 +561,41 @@ def _plain(rng: np.random.Generator, points: int, wrong: float) -> tuple:
         base, distance = direction(rng), rng.uniform(2, 6)
         centre = np.array([0, 0, -distance])
         ball = rng.normal(size=(4 * points, 3))
-        ball *= (rng.random(len(ball)) ** (1 / 3) / np.linalg.norm(ball, axis=1))[:, None]
+        ball *= (rng.random(len(ball)) ** (1 / 3) / np.linalg.norm(ball, axis=1))[
+            :, None
+        ]
         space = centre + ball * distance * rng.uniform(0.3, 0.7)
         rotation = looking(centre - base, rng.uniform(-np.pi, np.pi))
         (left, _), (right, _) = (
             project(space, np.eye(3), np.zeros(3), photo.focal),
             project(space, rotation, base, photo.focal),
         )
-        seen = (space[:, 2] < -0.3) & ((space - base) @ rotation[:, 2] < -0.3) & photo.holds(left) & photo.holds(right)
+        seen = (
+            (space[:, 2] < -0.3)
+            & ((space - base) @ rotation[:, 2] < -0.3)
+            & photo.holds(left)
+            & photo.holds(right)
+        )
         if np.sum(seen) >= points:
             break
     left, right = left[seen][:points], right[seen][:points]
     is_good = rng.permutation(points) < good
     right = np.where(is_good[:, None], right, photo.uniform(rng, points))
     left, right = (p + rng.normal(0, PLAIN_SIGMA, p.shape) for p in (left, right))
-    close = np.abs(sampson(left, right, photo.focal, rotation, base)) <= UNDECIDABLE * PLAIN_SIGMA
+    close = (
+        np.abs(sampson(left, right, photo.focal, rotation, base))
+        <= UNDECIDABLE * PLAIN_SIGMA
+    )
     there = np.ones(points, bool)
-    return *left.T, *right.T, there, is_good, ~is_good & close, photo.focal, PLAIN_SIGMA, rotation, base, True
+    return (
+        *left.T,
+        *right.T,
+        there,
+        is_good,
+        ~is_good & close,
+        photo.focal,
+        PLAIN_SIGMA,
+        rotation,
+        base,
+        True,
+    )

@@ -1,6 +1,8 @@
-"""The command line: `jaxro orient`, `clean`, `colmap`, `compare`, `reproduce`, `heights`, `plan`.
+"""The command line: `jaxro orient`, `clean`, `colmap`, `compare`, `reproduce`,
+`heights`, `plan`.
 
-Exit code 0: every pair has usable elements; 1: at least one has not; 2: the input could not be used.
+Exit code 0: every pair has usable elements; 1: at least one has not; 2: the input could
+not be used.
 """
 
 from collections.abc import Callable
@@ -10,15 +12,22 @@ from typing import Annotated
 try:
     import typer
 except ModuleNotFoundError:
-    raise SystemExit("The command line needs typer and rich: pip install 'jaxro[cli]'") from None
+    raise SystemExit(
+        "The command line needs typer and rich: pip install 'jaxro[cli]'"
+    ) from None
 
+from .commands import options as given
+from .commands.options import Engine, Residual
 from .experiments import REPRODUCTIONS
-from .io import arguments as given
-from .io.arguments import Engine, Residual
-from .io.fields import TableError
 from .rejection import PROCEDURES
+from .tables.fields import TableError
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
 
 
 @app.callback()
@@ -28,7 +37,9 @@ def main() -> None:
 
 @app.command()
 def orient(
-    file: Annotated[Path | None, given.file("Without it the embedded example is oriented.")] = None,
+    file: Annotated[
+        Path | None, given.file("Without it the embedded example is oriented.")
+    ] = None,
     camera: given.Camera = None,
     focal: given.Focal = None,
     principal_point: given.PrincipalPoint = None,
@@ -42,7 +53,8 @@ def orient(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for elements.csv, residuals.csv, points.csv, reliability.csv, summary.json.",
+            help="Folder for elements.csv, residuals.csv, points.csv, reliability.csv, "
+            "summary.json.",
             metavar="DIR",
             show_default=False,
         ),
@@ -54,34 +66,57 @@ def orient(
     parquet: given.Parquet = False,
     engine: given.Where = Engine.local,
 ) -> None:
-    """Orient every pair of FILE: elements with standard deviations, y-parallaxes, m_q, model points.
+    """Orient every pair of FILE: elements with standard deviations, y-parallaxes, m_q,
+    model points.
 
     Exit code 0: all usable; 1: some pair failed; 2: bad input, nothing written.
     """
-    from .io.job import Options, run
+    from .commands.orient import Options, run
 
     options = Options(
-        file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
+        file,
+        camera,
+        focal,
+        principal_point,
+        pixel_size,
+        y_down,
+        sigma,
+        elements,
+        base,
+        residual,
+        unit,
+        out,
+        force,
     ).at_level(confidence)
     if given.large(file, parquet, resume, tables, engine):
-        from .io import large
+        from .commands import large
 
-        _end(lambda: large.run(options, large.Large(tables, resume, engine=_engine(engine))))
+        _end(
+            lambda: large.run(
+                options, large.Large(tables, resume, engine=_engine(engine))
+            )
+        )
     else:
         _end(lambda: run(options))
 
 
 @app.command()
 def clean(
-    file: Annotated[Path | None, given.file("Without it a simulated example with one wrong point is cleaned.")] = None,
+    file: Annotated[
+        Path | None,
+        given.file("Without it a simulated example with one wrong point is cleaned."),
+    ] = None,
     procedure: Annotated[
         str | None,
-        typer.Option(help=f"One of {', '.join(PROCEDURES)}.", metavar="NAME", show_default=False),
+        typer.Option(
+            help=f"One of {', '.join(PROCEDURES)}.", metavar="NAME", show_default=False
+        ),
     ] = None,
     tolerance: Annotated[
         list[str] | None,
         typer.Option(
-            help="Another value for a number of the procedure, as often as wanted; an unknown NAME lists them.",
+            help="Another value for a number of the procedure, as often as wanted; an "
+            "unknown NAME lists them.",
             metavar="NAME=VALUE",
             show_default=False,
         ),
@@ -99,7 +134,8 @@ def clean(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for cleaned.csv (every row with its verdict), decisions.csv and decisions.json (how it came "
+            help="Folder for cleaned.csv (every row with its verdict), decisions.csv "
+            "and decisions.json (how it came "
             "about), and of the points kept the files of `jaxro orient`.",
             metavar="DIR",
             show_default=False,
@@ -113,18 +149,30 @@ def clean(
 ) -> None:
     """Find the wrong points of every pair of FILE.
 
-    Which, in what order, on what evidence; and the orientation of the points kept.
-    Exit code 0: all cleaned and usable; 1: some pair not; 2: bad input, nothing written.
+    Which, in what order, on what evidence; and the orientation of the points kept. Exit
+    code 0: all cleaned and usable; 1: some pair not; 2: bad input, nothing written.
     """
-    from .io.cleaning import DEFAULT, chosen, run
-    from .io.job import Options
+    from .commands.clean import DEFAULT, chosen, run
+    from .commands.orient import Options
 
     options = Options(
-        file, camera, focal, principal_point, pixel_size, y_down, sigma, elements, base, residual, unit, out, force
+        file,
+        camera,
+        focal,
+        principal_point,
+        pixel_size,
+        y_down,
+        sigma,
+        elements,
+        base,
+        residual,
+        unit,
+        out,
+        force,
     )
     name, changes = DEFAULT if procedure is None else procedure, tolerance or []
     if given.large(file, parquet, resume, tables, engine):
-        from .io import large
+        from .commands import large
 
         how = large.Large(tables, resume, engine=_engine(engine))
         _end(lambda: large.run(options, how, chosen(name, changes)))
@@ -137,25 +185,35 @@ def colmap(
     database: Annotated[
         Path,
         typer.Argument(
-            help="COLMAP database with cameras, keypoints and matches.", metavar="DATABASE.db", show_default=False
+            help="COLMAP database with cameras, keypoints and matches.",
+            metavar="DATABASE.db",
+            show_default=False,
         ),
     ],
     sigma: given.KeypointSigma = 1.0,
     out: Annotated[
         Path | None,
-        typer.Option(help="A copy to write to.  [default: the database itself]", metavar="NEW.db", show_default=False),
+        typer.Option(
+            help="A copy to write to.  [default: the database itself]",
+            metavar="NEW.db",
+            show_default=False,
+        ),
     ] = None,
     assume_calibrated: given.AssumeCalibrated = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace geometries that are there, and the file of --out.")
+        bool,
+        typer.Option(
+            "--force", help="Replace geometries that are there, and the file of --out."
+        ),
     ] = False,
 ) -> None:
     """Orient every matched pair of a COLMAP database.
 
-    In spite of wrong matches, photos in any position; writes two_view_geometries, all or none.
-    Exit code 0: every pair has a geometry; 1: some pair has none; 2: bad input, nothing written.
+    In spite of wrong matches, photos in any position; writes two_view_geometries, all
+    or none. Exit code 0: every pair has a geometry; 1: some pair has none; 2: bad
+    input, nothing written.
     """
-    from .io.colmap import Options, run
+    from .commands.colmap import Options, run
 
     _end(lambda: run(Options(database, sigma, out, force, assume_calibrated)))
 
@@ -163,19 +221,34 @@ def colmap(
 @app.command()
 def compare(
     file: Annotated[
-        Path | None, given.file("Its first pair is the layout; without it 16 points in eight rows, and 8 points.")
+        Path | None,
+        given.file(
+            "Its first pair is the layout; without it 16 points in eight rows, and 8 "
+            "points."
+        ),
     ] = None,
     procedure: Annotated[
         list[str] | None,
-        typer.Option(help="As often as wanted.  [default: every procedure]", metavar="NAME", show_default=False),
+        typer.Option(
+            help="As often as wanted.  [default: every procedure]",
+            metavar="NAME",
+            show_default=False,
+        ),
     ] = None,
-    errors: Annotated[str, typer.Option(help="Numbers of wrong points.", metavar="N,N,...")] = "0,1,2,3",
-    size: Annotated[str, typer.Option(help="Sizes of their errors, in sigma.", metavar="K,K,...")] = "4,6,8,10,15",
-    trials: Annotated[int, typer.Option(help="Simulated pairs in every setting.", metavar="T")] = 1000,
+    errors: Annotated[
+        str, typer.Option(help="Numbers of wrong points.", metavar="N,N,...")
+    ] = "0,1,2,3",
+    size: Annotated[
+        str, typer.Option(help="Sizes of their errors, in sigma.", metavar="K,K,...")
+    ] = "4,6,8,10,15",
+    trials: Annotated[
+        int, typer.Option(help="Simulated pairs in every setting.", metavar="T")
+    ] = 1000,
     false_alarms: Annotated[
         float,
         typer.Option(
-            help="Share of pairs without errors that lose a point in the comparison at equal terms; 0: without it.",
+            help="Share of pairs without errors that lose a point in the comparison at "
+            "equal terms; 0: without it.",
             metavar="P",
         ),
     ] = 0.05,
@@ -188,7 +261,8 @@ def compare(
     sigma: Annotated[
         float | None,
         typer.Option(
-            help="Standard deviation of the simulated coordinates, in the units of the table.  "
+            help="Standard deviation of the simulated coordinates, in the units of the "
+            "table.  "
             "[default: the column sigma, or sigma0 of the pair; 0.01 mm without FILE]",
             metavar="SD",
             show_default=False,
@@ -196,36 +270,58 @@ def compare(
     ] = None,
     unit: given.Unit = "mm",
     out: Annotated[
-        Path | None, typer.Option(help="The figures in full precision.", metavar="FILE.csv", show_default=False)
+        Path | None,
+        typer.Option(
+            help="The figures in full precision.",
+            metavar="FILE.csv",
+            show_default=False,
+        ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --out.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Overwrite the file of --out.")
+    ] = False,
 ) -> None:
     """Compare procedures on the layout of FILE.
 
-    By simulation: what each finds of the errors planted, and what it costs in good points.
-    Exit code 0: done; 2: bad input, nothing written.
+    By simulation: what each finds of the errors planted, and what it costs in good
+    points. Exit code 0: done; 2: bad input, nothing written.
     """
-    from .io.job import Options
-    from .io.simulating import Wanted, run_comparison
+    from .commands.orient import Options
+    from .commands.simulate import Wanted, run_comparison
 
-    options = Options(file, camera, focal, principal_point, pixel_size, y_down, sigma, unit=unit)
-    wanted = Wanted(procedure or [], errors, size, trials, seed, false_alarms, out, force)
+    options = Options(
+        file, camera, focal, principal_point, pixel_size, y_down, sigma, unit=unit
+    )
+    wanted = Wanted(
+        procedure or [], errors, size, trials, seed, false_alarms, out, force
+    )
     _end(lambda: run_comparison(options, wanted))
 
 
 @app.command()
 def reproduce(
-    name: Annotated[str, typer.Argument(help=f"One of {', '.join(REPRODUCTIONS)}.", metavar="NAME")],
+    name: Annotated[
+        str, typer.Argument(help=f"One of {', '.join(REPRODUCTIONS)}.", metavar="NAME")
+    ],
     trials: Annotated[
         int | None,
-        typer.Option(help="Simulated pairs.  [default: as many as the paper]", metavar="T", show_default=False),
+        typer.Option(
+            help="Simulated pairs.  [default: as many as the paper]",
+            metavar="T",
+            show_default=False,
+        ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Seed of the random numbers.  [default: 0]", metavar="S", show_default=False)
+        int | None,
+        typer.Option(
+            help="Seed of the random numbers.  [default: 0]",
+            metavar="S",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
     """Calculate a paper's tables beside the print."""
-    from .io import simulating
+    from .commands import simulate as simulating
 
     _end(lambda: simulating.reproduce(name, trials, seed))
 
@@ -235,7 +331,8 @@ def heights(
     file: Annotated[
         Path | None,
         typer.Argument(
-            help="CSV table, mm: point,square,parallax, optionally grid (the grid read at the point), x, y (for the "
+            help="CSV table, mm: point,square,parallax, optionally grid (the grid read "
+            "at the point), x, y (for the "
             "picture), height (where it is known). Without it a simulated plot.",
             metavar="READINGS.csv",
             show_default=False,
@@ -249,7 +346,8 @@ def heights(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for heights.csv, traverses.csv, legs.csv, summary.json, surface.png.",
+            help="Folder for heights.csv, traverses.csv, legs.csv, summary.json, "
+            "surface.png.",
             metavar="DIR",
             show_default=False,
         ),
@@ -258,58 +356,97 @@ def heights(
 ) -> None:
     """Heights over a grid of squares from parallaxes.
 
-    With standard deviations, adjusted over the traverses between points, whose misclosures are tested.
-    Exit code 0: done; 1: a wrong leg, or a known height that is not what is read there; 2: bad input, nothing written.
+    With standard deviations, adjusted over the traverses between points, whose
+    misclosures are tested. Exit code 0: done; 1: a wrong leg, or a known height that is
+    not what is read there; 2: bad input, nothing written.
     """
-    from .io.height_job import Options, run
+    from .commands.heights import Options, run
 
-    _end(lambda: run(Options(file, grid, traverses, camera_height, base, sd or [], out, force)))
+    _end(
+        lambda: run(
+            Options(file, grid, traverses, camera_height, base, sd or [], out, force)
+        )
+    )
 
 
 @app.command()
 def plan(
     focal: Annotated[float, typer.Option(help="Focal length, mm.", metavar="F")] = 75.0,
-    camera_height: Annotated[float, typer.Option(help="Of the cameras over the grid, mm.", metavar="H")] = 2100.0,
+    camera_height: Annotated[
+        float, typer.Option(help="Of the cameras over the grid, mm.", metavar="H")
+    ] = 2100.0,
     base: given.HorizontalBase = None,
     side: Annotated[float, typer.Option(help="Of a square, mm.", metavar="L")] = 100.0,
-    depth: Annotated[float, typer.Option(help="Of the points below the grid, mm.", metavar="D")] = 200.0,
-    step: Annotated[float, typer.Option(help="Difference of height of neighbouring points, mm.", metavar="D")] = 20.0,
+    depth: Annotated[
+        float, typer.Option(help="Of the points below the grid, mm.", metavar="D")
+    ] = 200.0,
+    step: Annotated[
+        float,
+        typer.Option(
+            help="Difference of height of neighbouring points, mm.", metavar="D"
+        ),
+    ] = 20.0,
     legs: Annotated[int, typer.Option(help="Of a traverse.", metavar="N")] = 9,
-    traverses: Annotated[int, typer.Option(help="That meet in a node.", metavar="K")] = 3,
+    traverses: Annotated[
+        int, typer.Option(help="That meet in a node.", metavar="K")
+    ] = 3,
     sd: given.Deviation = None,
     want: Annotated[
         float | None,
         typer.Option(
-            help="A standard deviation, mm, that base or camera height should give.", metavar="M", show_default=False
+            help="A standard deviation, mm, that base or camera height should give.",
+            metavar="M",
+            show_default=False,
         ),
     ] = None,
     of: Annotated[
-        str, typer.Option(help="What is wanted: height, difference, in-square, middle, node, detail.", metavar="WHAT")
+        str,
+        typer.Option(
+            help="What is wanted: height, difference, in-square, middle, node, detail.",
+            metavar="WHAT",
+        ),
     ] = "height",
 ) -> None:
     """Accuracy to expect of a survey over a grid.
 
-    Of heights, differences, traverses and nodes, and what each source of error adds; or what a wanted one needs.
-    Without --base the largest, a quarter of the camera height. Exit code 0: done; 2: bad input, or not reachable.
+    Of heights, differences, traverses and nodes, and what each source of error adds; or
+    what a wanted one needs. Without --base the largest, a quarter of the camera height.
+    Exit code 0: done; 2: bad input, or not reachable.
     """
-    from .io.height_plan import Options, run
+    from .commands.plan import Options, run
 
-    _end(lambda: run(Options(focal, camera_height, base, side, depth, step, legs, traverses, sd or [], want, of)))
+    _end(
+        lambda: run(
+            Options(
+                focal,
+                camera_height,
+                base,
+                side,
+                depth,
+                step,
+                legs,
+                traverses,
+                sd or [],
+                want,
+                of,
+            )
+        )
+    )
 
 
 def _engine(name: Engine) -> Callable:
-    from .distributed import on_ray
-    from .io.streaming import here
+    from .commands.cluster import on_ray
+    from .commands.stream import here
 
     return {Engine.local: here, Engine.ray: on_ray}[name]
 
 
 def _end(work: Callable[[], bool]) -> None:
     """Do the work with compiled programs kept; the exit code says how it ended."""
-    from . import program_store
-    from .io.console import aborted
+    from .reports.terminal import aborted
+    from .xla import store
 
-    program_store.use(program_store.default_folder())
+    store.use(store.default_folder())
     try:
         good = work()
     except KeyboardInterrupt:

@@ -1,4 +1,5 @@
-"""Strict settings for every test, shapes checked at run time, and the folder of measured data."""
+"""Strict settings for every test, shapes checked at run time, and the folder of
+measured data."""
 
 import atexit
 import gc
@@ -11,28 +12,37 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-# has to come before the first import of the package, in this process and for its submodules
+# has to come before the first import of the package, in this process and for its
+# submodules
 install_import_hook("jaxro", "beartype.beartype")
 
 os.environ["JAXRO_CACHE"] = ""  # no test finds what another one left
 # most of the time goes into compiling programs that run once
 cheap = ["backend_optimization_level=0", "cpu_parallel_codegen_split_count=1"]
-# later compilers have no older code generator, and end the process at a name that they do not know
+# later compilers have no older code generator, and end the process at a name that they
+# do not know
 if tuple(map(int, version("jaxlib").split(".")[:3])) <= (0, 11, 0):
     cheap.append("cpu_use_fusion_emitters=false")
-os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *(f"--xla_{flag}" for flag in cheap)]).strip()
-# what several tests, or processes they start, compile is compiled once; given a size, JAX locks the folder to write
-if "PYTEST_XDIST_WORKER" not in os.environ:  # the process that starts the others, and with which the folder goes
+os.environ["XLA_FLAGS"] = " ".join(
+    [os.environ.get("XLA_FLAGS", ""), *(f"--xla_{flag}" for flag in cheap)]
+).strip()
+# what several tests, or processes they start, compile is compiled once; given a size,
+# JAX locks the folder to write. A folder given by the caller outlives the run.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxro-tests-")
-    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+    atexit.register(
+        shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True
+    )
 os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(1 << 34)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 import jax  # noqa: E402
 
-from jaxro import programs  # noqa: E402  (64 bit)
+from jaxro.xla import programs  # noqa: E402
 
-gc.disable()  # what JAX keeps of the programs would be looked through at every collection: a sixteenth of the time
+# what JAX keeps of the programs would be looked through at every collection: a
+# sixteenth of the time
+gc.disable()
 programs.QUICK.update(programs.QUICKEST)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -40,7 +50,8 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 @pytest.fixture(scope="module", autouse=True)
 def memory():
-    """Gives back the programs of a file at its end: of all files together they take more than 20 GB."""
+    """Gives back the programs of a file at its end: of all files together they take
+    more than 20 GB."""
     yield
     jax.clear_caches()
     gc.collect()
@@ -52,5 +63,7 @@ def data() -> Path:
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
     folder = Path(os.environ.get("JAXRO_DATA", beside))
     if not folder.is_dir():
-        pytest.skip(f"no measured data at {folder}: set JAXRO_DATA to the folder that holds it")
+        pytest.skip(
+            f"no measured data at {folder}: set JAXRO_DATA to the folder that holds it"
+        )
     return folder

@@ -14,22 +14,32 @@ FOCAL = 150.0
 @lru_cache
 def turned(turn):
     """Wolf's matrix of (omega, phi, kappa)."""
-    return np.asarray(jaxro.rotations.as_array(jaxro.rotations.m_omega_phi_kappa(*(jnp.asarray(a) for a in turn))))
+    return np.asarray(
+        jaxro.rotations.as_array(
+            jaxro.rotations.m_omega_phi_kappa(*(jnp.asarray(a) for a in turn))
+        )
+    )
 
 
 def photographed(points, turn=(0.0, 0.0, 0.0), base=(1.0, 0.0, 0.0), sigma=0.0, seed=0):
-    """Photos of points (n, 3) given in bases, left photo at the origin looking along -z, right one turned (Wolf)."""
+    """Photos of points (n, 3) given in bases, left photo at the origin looking along
+    -z, right one turned (Wolf)."""
     points = np.asarray(points, float)
     left, right = points, (points - np.asarray(base)) @ turned(turn).T
     noise = np.random.default_rng(seed).normal(size=(4, len(points))) * sigma
     coordinates = [-FOCAL * left[:, 0] / left[:, 2], -FOCAL * left[:, 1] / left[:, 2]]
-    coordinates += [-FOCAL * right[:, 0] / right[:, 2], -FOCAL * right[:, 1] / right[:, 2]]
+    coordinates += [
+        -FOCAL * right[:, 0] / right[:, 2],
+        -FOCAL * right[:, 1] / right[:, 2],
+    ]
     return jaxro.pair(*(np.asarray(coordinates) + noise), focal=FOCAL)
 
 
 def block(n=12, seed=1, depth=(1.5, 2.2)):
     rng = np.random.default_rng(seed)
-    return np.column_stack([rng.uniform(-0.2, 1.2, n), rng.uniform(-1, 1, n), -rng.uniform(*depth, n)])
+    return np.column_stack(
+        [rng.uniform(-0.2, 1.2, n), rng.uniform(-1, 1, n), -rng.uniform(*depth, n)]
+    )
 
 
 def outcome(pair, **options):
@@ -38,11 +48,16 @@ def outcome(pair, **options):
 
 
 def name(orientation):
-    return next(key for key, member in RESULTS._name_to_item.items() if bool(orientation.result == member))
+    return next(
+        key
+        for key, member in RESULTS._name_to_item.items()
+        if bool(orientation.result == member)
+    )
 
 
 def in_any_position(points, count, seed, sigma):
-    """`count` pairs of such points (rng -> (n, 3), in bases): photos in any position, the mean point ahead of both."""
+    """`count` pairs of such points (rng -> (n, 3), in bases): photos in any position,
+    the mean point ahead of both."""
     rng, pairs, truth = np.random.default_rng(seed), [], []
     while len(pairs) < count:
         ground, base = points(rng), rng.normal(size=3)
@@ -57,23 +72,35 @@ def in_any_position(points, count, seed, sigma):
 
 
 def on_a_critical_surface(count, points, seed, sigma):
-    """`count` pairs in any position of which every point fits two orientations (R, b), (S, c), in front of all photos.
+    """`count` pairs in any position of which every point fits two orientations (R, b),
+    (S, c), in front of all photos.
 
-    The right photo of a ray p lies where its two epipolar lines meet, (p.[b]R) x (p.[c]S). Coordinates and b.
+    The right photo of a ray p lies where its two epipolar lines meet, (p.[b]R) x
+    (p.[c]S). Coordinates and b.
     """
     rng, pairs, truth = np.random.default_rng(seed), [], []
     span = FOCAL * 0.75
     while len(pairs) < count:
-        angles, base = rng.uniform(-1, 1, 3) * (0.5, 0.5, np.pi), rng.normal(size=(2, 3)) * [[1.0], [0.5]]
-        first, second = (turned((*a,)).T for a in (angles, angles + rng.normal(size=3) * 0.3))
-        both = [(r, b / np.linalg.norm(b)) for r, b in ((first, base[0]), (second, base[0] + base[1]))]
+        angles, base = (
+            rng.uniform(-1, 1, 3) * (0.5, 0.5, np.pi),
+            rng.normal(size=(2, 3)) * [[1.0], [0.5]],
+        )
+        first, second = (
+            turned((*a,)).T for a in (angles, angles + rng.normal(size=3) * 0.3)
+        )
+        both = [
+            (r, b / np.linalg.norm(b))
+            for r, b in ((first, base[0]), (second, base[0] + base[1]))
+        ]
         p = np.column_stack([rng.uniform(-span, span, (200, 2)), np.full(200, -FOCAL)])
         q = np.cross(*(np.cross(p, b) @ r for r, b in both))
         q *= -FOCAL / q[:, 2:]
         seen = np.max(np.abs(q[:, :2]), axis=1) < span
         for r, b in both:
             a, c = q @ r.T, np.cross(p, q @ r.T)
-            seen &= (np.sum(np.cross(b, a) * c, axis=1) > 0) & (np.sum(np.cross(b, p) * c, axis=1) > 0)
+            seen &= (np.sum(np.cross(b, a) * c, axis=1) > 0) & (
+                np.sum(np.cross(b, p) * c, axis=1) > 0
+            )
         if np.sum(seen) >= points:
             measured = np.concatenate([p[seen][:points, :2].T, q[seen][:points, :2].T])
             pairs.append(measured + rng.normal(size=measured.shape) * sigma)

@@ -1,7 +1,9 @@
-"""An independent judge in plain NumPy: slow, textbook, and without one line of the package.
+"""An independent judge in plain NumPy: slow, textbook, and without one line of the
+package.
 
-Photo vectors are p = (x, y, -f); derivatives are complex steps, Im f(x + ih) / h, exact to the last digit for the
-polynomials and sines used here, so nothing is differentiated by hand or by JAX.
+Photo vectors are p = (x, y, -f); derivatives are complex steps, Im f(x + ih) / h, exact
+to the last digit for the polynomials and sines used here, so nothing is differentiated
+by hand or by JAX.
 """
 
 from typing import NamedTuple
@@ -46,7 +48,14 @@ def wolf(omega, phi, kappa):
 
 def papers(alpha, omega, chi):
     """R = R_alpha R_omega R_chi, image to model, as written out for the 1971 paper."""
-    ca, sa, co, so, cc, sc = np.cos(alpha), np.sin(alpha), np.cos(omega), np.sin(omega), np.cos(chi), np.sin(chi)
+    ca, sa, co, so, cc, sc = (
+        np.cos(alpha),
+        np.sin(alpha),
+        np.cos(omega),
+        np.sin(omega),
+        np.cos(chi),
+        np.sin(chi),
+    )
     r_alpha = np.array([[ca, 0, -sa], [0, 1, 0], [sa, 0, ca]])
     r_omega = np.array([[1, 0, 0], [0, co, -so], [0, so, co]])
     r_chi = np.array([[cc, -sc, 0], [sc, cc, 0], [0, 0, 1]])
@@ -54,7 +63,8 @@ def papers(alpha, omega, chi):
 
 
 def dependent(bx):
-    """Elements (by, bz, omega, phi, kappa) as a function to (left rotation, right rotation, base)."""
+    """Elements (by, bz, omega, phi, kappa) as a function to (left rotation, right
+    rotation, base)."""
 
     def placed(e):
         return np.eye(3), wolf(e[2], e[3], e[4]).T, np.array([bx, e[0], e[1]])
@@ -63,7 +73,8 @@ def dependent(bx):
 
 
 def independent(e):
-    """Elements (alpha, chi, omega', alpha', chi') to (left rotation, right rotation, base)."""
+    """Elements (alpha, chi, omega', alpha', chi') to (left rotation, right rotation,
+    base)."""
     return papers(e[0], 0.0, e[1]), papers(e[3], e[2], e[4]), np.array([1.0, 0.0, 0.0])
 
 
@@ -73,7 +84,8 @@ def vectors(x, y, focal):
 
 
 def condition(placed, elements, coordinates, focal):
-    """det(b, R1 p1, R2 p2) of every point. coordinates: (4, point); focal: (left, right)."""
+    """det(b, R1 p1, R2 p2) of every point. coordinates: (4, point); focal: (left,
+    right)."""
     left, right, base = placed(elements)
     ray1 = vectors(coordinates[0], coordinates[1], focal[0]) @ left.T
     ray2 = vectors(coordinates[2], coordinates[3], focal[1]) @ right.T
@@ -81,7 +93,8 @@ def condition(placed, elements, coordinates, focal):
 
 
 class Adjustment(NamedTuple):
-    """Elements, their standard deviations and cofactor, sigma0, corrections (4, point), redundancy numbers."""
+    """Elements, their standard deviations and cofactor, sigma0, corrections (4, point),
+    redundancy numbers."""
 
     elements: np.ndarray
     deviations: np.ndarray
@@ -92,10 +105,12 @@ class Adjustment(NamedTuple):
 
 
 def gauss_helmert(coordinates, focal, placed, start, sigma=1.0):
-    """Minimise sum (v / sigma)² subject to condition(elements, l + v) = 0 exactly, by the Gauss-Helmert iteration.
+    """Minimise sum (v / sigma)² subject to condition(elements, l + v) = 0 exactly, by
+    the Gauss-Helmert iteration.
 
-    Linearised at the adjusted measurements in every step (not at the measured ones), so that at the end the corrected
-    rays do intersect. `sigma`: one value or one per point.
+    Linearised at the adjusted measurements in every step (not at the measured ones), so
+    that at the end the corrected rays do intersect. `sigma`: one value or one per
+    point.
     """
     measured = np.asarray(coordinates, float)
     focal = (focal, focal) if np.ndim(focal) == 0 else focal
@@ -103,14 +118,24 @@ def gauss_helmert(coordinates, focal, placed, start, sigma=1.0):
     elements, v = np.array(start, float), np.zeros_like(measured)
     for _ in range(100):
         adjusted = measured + v
-        a = jacobian(lambda e, fixed=adjusted: condition(placed, e, fixed, focal), elements)
+        a = jacobian(
+            lambda e, fixed=adjusted: condition(placed, e, fixed, focal), elements
+        )
         b = np.stack(
             [
-                condition(placed, elements, adjusted + 1j * STEP * np.eye(4)[i][:, None], focal).imag / STEP
+                condition(
+                    placed,
+                    elements,
+                    adjusted + 1j * STEP * np.eye(4)[i][:, None],
+                    focal,
+                ).imag
+                / STEP
                 for i in range(4)
             ]
         )
-        misclosure = condition(placed, elements, adjusted, focal) - np.sum(b * v, axis=0)
+        misclosure = condition(placed, elements, adjusted, focal) - np.sum(
+            b * v, axis=0
+        )
         w = np.sum(b * b, axis=0) * q
         normal = (a / w[:, None]).T @ a
         step = -np.linalg.solve(normal, a.T @ (misclosure / w))
@@ -123,11 +148,14 @@ def gauss_helmert(coordinates, focal, placed, start, sigma=1.0):
     sigma0 = np.sqrt(np.sum(v * v / q) / freedom) if freedom else np.nan
     # the diagonal of Q_vv P, the four coordinates of a point added up
     redundancy = 1 - np.sum((a @ cofactor) * a, axis=1) / w
-    return Adjustment(elements, sigma0 * np.sqrt(np.diag(cofactor)), cofactor, sigma0, v, redundancy)
+    return Adjustment(
+        elements, sigma0 * np.sqrt(np.diag(cofactor)), cofactor, sigma0, v, redundancy
+    )
 
 
 def y_parallax(elements, coordinates, focal):
-    """q = -f (Y1/Z1 - Y2/Z2) of the photos turned parallel to the base, elements of the independent system."""
+    """q = -f (Y1/Z1 - Y2/Z2) of the photos turned parallel to the base, elements of the
+    independent system."""
     left, right, _ = independent(elements)
     ray1 = vectors(coordinates[0], coordinates[1], focal) @ left.T
     ray2 = vectors(coordinates[2], coordinates[3], focal) @ right.T
@@ -135,7 +163,8 @@ def y_parallax(elements, coordinates, focal):
 
 
 def gauss_newton(coordinates, focal, iterations, start=(0.0,) * 5):
-    """Minimise sum q² from `start`: parallaxes before each iteration and elements after it, as table 2 prints them."""
+    """Minimise sum q² from `start`: parallaxes before each iteration and elements after
+    it, as table 2 prints them."""
     elements, parallaxes, results = np.array(start, float), [], []
     for _ in range(iterations):
         q = y_parallax(elements, coordinates, focal)
@@ -152,7 +181,8 @@ def m_q(q):
 
 
 def intersect(coordinates, focal, placed, elements):
-    """(point, 3): the midpoint of the shortest distance between the two rays, in the frame of the elements."""
+    """(point, 3): the midpoint of the shortest distance between the two rays, in the
+    frame of the elements."""
     focal = (focal, focal) if np.ndim(focal) == 0 else focal
     left, right, base = placed(np.asarray(elements))
     ray1 = vectors(coordinates[0], coordinates[1], focal[0]) @ left.T
@@ -168,8 +198,15 @@ ZONES = {1: (0, 0), 2: (1, 0), 3: (0, 1), 4: (1, 1), 5: (0, -1), 6: (1, -1)}
 
 
 def first_order(zones):
-    """Coefficients of (alpha, chi, omega', alpha', chi') in the 1971 paper's equations (5) and (7), f = b = y = 1."""
-    return np.array([(x * y, x, -(1 + y * y), (1 - x) * y, 1 - x) for x, y in (ZONES[z] for z in zones)], float)
+    """Coefficients of (alpha, chi, omega', alpha', chi') in the 1971 paper's equations
+    (5) and (7), f = b = y = 1."""
+    return np.array(
+        [
+            (x * y, x, -(1 + y * y), (1 - x) * y, 1 - x)
+            for x, y in (ZONES[z] for z in zones)
+        ],
+        float,
+    )
 
 
 def angle(m):

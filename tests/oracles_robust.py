@@ -1,6 +1,8 @@
-"""The modern procedures in plain NumPy: dense matrices, one pair at a time, dependent elements of unit base.
+"""The modern procedures in plain NumPy: dense matrices, one pair at a time, dependent
+elements of unit base.
 
-Points are columns of (4, point) coordinates; `share` is the part of its weight that a point has in the solution.
+Points are columns of (4, point) coordinates; `share` is the part of its weight that a
+point has in the solution.
 """
 
 from itertools import combinations
@@ -13,13 +15,17 @@ PLACED = oracles.dependent(1.0)
 
 
 def linearised(points, focal, sigma, elements):
-    """The whitened condition r = g / (sigma |dg/dl|) and its columns, the denominator held."""
+    """The whitened condition r = g / (sigma |dg/dl|) and its columns, the denominator
+    held."""
     g = lambda e: oracles.condition(PLACED, e, points, (focal, focal))
     slopes = []
     for k in range(4):
         moved = points.astype(complex)
         moved[k] += 1j * oracles.STEP
-        slopes.append(oracles.condition(PLACED, elements, moved, (focal, focal)).imag / oracles.STEP)
+        slopes.append(
+            oracles.condition(PLACED, elements, moved, (focal, focal)).imag
+            / oracles.STEP
+        )
     spread = sigma * np.sqrt(np.sum(np.square(slopes), axis=0))
     return g(elements) / spread, oracles.jacobian(g, elements) / spread[:, None]
 
@@ -43,28 +49,37 @@ def standardised(points, focal, sigma, share, elements):
 
 
 def reweighted(points, focal, sigma, weight, limit, rounds=200, convex=5, full=15):
-    """The points with |w| <= limit at the fixed point of w -> weight(w) next to that of Huber's weights, and whether it
-    rests; after `full` rounds the mean of new and last weights. A solution that runs away does not rest."""
+    """The points with |w| <= limit at the fixed point of w -> weight(w) next to that of
+    Huber's weights, and whether it rests; after `full` rounds the mean of new and last
+    weights. A solution that runs away does not rest."""
     share = np.ones(points.shape[1])
     elements = solved(points, focal, sigma, share, np.zeros(5))
     try:
         for k in range(rounds):
             w = standardised(points, focal, sigma, share, elements)[0]
-            new = np.minimum(1, 1.345 / np.maximum(w, 1e-9)) if k < convex else weight(w)
+            new = (
+                np.minimum(1, 1.345 / np.maximum(w, 1e-9)) if k < convex else weight(w)
+            )
             share = new if k < convex + full else (share + new) / 2
-            before, elements = elements, solved(points, focal, sigma, share, elements, 1)
+            before, elements = (
+                elements,
+                solved(points, focal, sigma, share, elements, 1),
+            )
             if np.max(np.abs(elements)) > 1:
                 break
             if k >= convex and np.max(np.abs(elements - before)) < 1e-9:
-                return standardised(points, focal, sigma, share, elements)[0] <= limit, True
+                return standardised(points, focal, sigma, share, elements)[
+                    0
+                ] <= limit, True
     except np.linalg.LinAlgError:
         pass
     return np.zeros(points.shape[1], bool), False
 
 
 def snooping(points, focal, sigma, level, estimated=False, least=6, doubt=0.01):
-    """The points in the order in which the largest |w| (or tau, with sigma0) goes while it exceeds its quantile, and
-    the points of which one is wrong at the end: without those the largest |w| is below that of `doubt`."""
+    """The points in the order in which the largest |w| (or tau, with sigma0) goes while
+    it exceeds its quantile, and the points of which one is wrong at the end: without
+    those the largest |w| is below that of `doubt`."""
     used, gone = list(range(points.shape[1])), []
     while len(used) >= least:
         w = of_used(points, focal, sigma, used, estimated)
@@ -75,7 +90,9 @@ def snooping(points, focal, sigma, level, estimated=False, least=6, doubt=0.01):
         named = [best] if len(used) > 6 else used
         for j, others in zip(used, rest, strict=True):
             if j != best and len(used) > 6:
-                without = of_used(points, focal, sigma, others, estimated)[others.index(best)]
+                without = of_used(points, focal, sigma, others, estimated)[
+                    others.index(best)
+                ]
                 if without <= quantile(doubt, len(others), estimated):
                     named = [*named, j]
         if len(named) > 1:
@@ -93,7 +110,9 @@ def of_used(points, focal, sigma, used, estimated):
     elements = solved(here, focal, sigma, every, np.zeros(5))
     w, h = standardised(here, focal, sigma, every, elements)
     if estimated:
-        w = w / np.sqrt(np.sum(linearised(here, focal, sigma, elements)[0] ** 2) / (len(used) - 5))
+        w = w / np.sqrt(
+            np.sum(linearised(here, focal, sigma, elements)[0] ** 2) / (len(used) - 5)
+        )
     w[1 - h < 1e-6] = 0
     return w
 
@@ -108,8 +127,8 @@ def quantile(level, count, estimated):
 
 
 def fewest_omissions(points, focal, sigma, most, level):
-    """The omissions, fewest first, whose Σ r² passes the chi-squared test and is the least of its number; every one
-    solved."""
+    """The omissions, fewest first, whose Σ r² passes the chi-squared test and is the
+    least of its number; every one solved."""
     n = points.shape[1]
     for k in range(most + 1):
         left = {}

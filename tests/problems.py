@@ -10,9 +10,10 @@ import numpy as np
 import oracles
 
 import jaxro
-from jaxro import DependentElements, IndependentElements, Pair, RelativePose, pair, simulation
+from jaxro import DependentElements, IndependentElements, Pair, RelativePose, pair
 from jaxro.experiments import dorozhinsky1971
-from jaxro.programs import QUICK, known
+from jaxro.geometry import mock_pairs
+from jaxro.xla.programs import QUICK, known
 
 orient = jaxro.orient
 """Compiled once per element system, residual and shape for the whole run of tests."""
@@ -33,10 +34,14 @@ DEWITT = np.array(
         [88.599, -85.274, -0.965, -94.319],
     ]
 ).T
-"""x_left, y_left, x_right, y_right of points a to f (mm); the sample of Dewitt's public-domain program."""
+"""x_left, y_left, x_right, y_right of points a to f (mm); the sample of Dewitt's
+public-domain program."""
 
-TABLE_1_ERRORS = np.array([0, 0, 0, 0, 0, 0, 2.0, 2.2, -2.43, -1.90, 0, 0, 0, 0, -0.60, 2.1])
-"""Errors of the right-hand y behind table 1 (1971) in mm; the signs at 9 and 10 and the error at 15 are recovered."""
+TABLE_1_ERRORS = np.array(
+    [0, 0, 0, 0, 0, 0, 2.0, 2.2, -2.43, -1.90, 0, 0, 0, 0, -0.60, 2.1]
+)
+"""Errors of the right-hand y behind table 1 (1971) in mm; the signs at 9 and 10 and the
+error at 15 are recovered."""
 
 
 def dewitt() -> Pair:
@@ -46,8 +51,10 @@ def dewitt() -> Pair:
 
 def table_1(points: int) -> Pair:
     """The flat mock pair of table 1 with the first `points` points."""
-    flat = simulation.mock_pair(simulation.standard_layout(points), focal=70.0, base=70.0, y_range=70.0)
-    return simulation.planted(flat, y_right=TABLE_1_ERRORS[:points])
+    flat = mock_pairs.mock_pair(
+        mock_pairs.standard_layout(points), focal=70.0, base=70.0, y_range=70.0
+    )
+    return mock_pairs.planted(flat, y_right=TABLE_1_ERRORS[:points])
 
 
 table_2 = dorozhinsky1971.table_2
@@ -55,23 +62,32 @@ table_2 = dorozhinsky1971.table_2
 
 
 def tilted(sigma: float = 0.01, seed: int = 0) -> Pair:
-    """Sixteen points with relief, photos tilted by a few degrees, normal errors: the usual measured pair."""
-    elements = IndependentElements(*(jnp.asarray(e) for e in (0.03, -0.05, 0.04, -0.02, 0.06)))
+    """Sixteen points with relief, photos tilted by a few degrees, normal errors: the
+    usual measured pair."""
+    elements = IndependentElements(
+        *(jnp.asarray(e) for e in (0.03, -0.05, 0.04, -0.02, 0.06))
+    )
     heights_key, noise_key = jax.random.split(jax.random.key(seed))
-    layout = simulation.row_layout()
-    heights = simulation.relief(heights_key, layout, 8.0)
-    return simulation.noisy(simulation.mock_pair(layout, elements, heights=heights), noise_key, sigma)
+    layout = mock_pairs.row_layout()
+    heights = mock_pairs.relief(heights_key, layout, 8.0)
+    return mock_pairs.noisy(
+        mock_pairs.mock_pair(layout, elements, heights=heights), noise_key, sigma
+    )
 
 
 def read(path: Path, focal: float) -> Pair:
     """A pair from a table with the columns id, xl, yl, xr, yr."""
     with path.open() as file:
         rows = list(csv.DictReader(file))
-    return pair(*(np.array([float(row[c]) for row in rows]) for c in ("xl", "yl", "xr", "yr")), focal=focal)
+    return pair(
+        *(np.array([float(row[c]) for row in rows]) for c in ("xl", "yl", "xr", "yr")),
+        focal=focal,
+    )
 
 
 def rotation_base(pose: RelativePose) -> tuple[np.ndarray, np.ndarray]:
-    """(R, b) of one pose as arrays, written out here once more so that the package is not its own judge."""
+    """(R, b) of one pose as arrays, written out here once more so that the package is
+    not its own judge."""
     w, x, y, z = (float(c) for c in (pose.qw, pose.qx, pose.qy, pose.qz))
     matrix = np.array(
         [
@@ -83,7 +99,9 @@ def rotation_base(pose: RelativePose) -> tuple[np.ndarray, np.ndarray]:
     return matrix, np.array([float(c) for c in (pose.bx, pose.by, pose.bz)])
 
 
-def difference(pose: RelativePose, rotation: np.ndarray, base: np.ndarray) -> tuple[float, float]:
+def difference(
+    pose: RelativePose, rotation: np.ndarray, base: np.ndarray
+) -> tuple[float, float]:
     """Angles (rad) between the rotations and between the base directions."""
     r, b = rotation_base(pose)
     return oracles.angle(r.T @ rotation), oracles.angle_between(b, base)

@@ -1,4 +1,5 @@
-"""Least squares of any conditions between parameters and measurements. It knows no photo."""
+"""Least squares of any conditions between parameters and measurements. It knows no
+photo."""
 
 from .joint import JointAdjustment as JointAdjustment
 from .least_squares import Adjustment as Adjustment, adjust as adjust

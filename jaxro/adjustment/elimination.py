@@ -1,11 +1,14 @@
-"""Normal equations of many blocks of parameters, the most numerous of which are eliminated.
+"""Normal equations of many blocks of parameters, the most numerous of which are
+eliminated.
 
-With kept parameters x, eliminated blocks y_e (object points, say) that no condition joins to one another, and
+With kept parameters x, eliminated blocks y_e (object points, say) that no condition
+joins to one another, and
 
     [ N   Wᵀ ] [x]   [h]
     [ W   V  ] [y] = [g],    V block-diagonal,
 
-the kept ones solve (N - Wᵀ V⁻¹ W) x = h - Wᵀ V⁻¹ g (Schur complement), and y = V⁻¹ (g - W x) follows block by block.
+the kept ones solve (N - Wᵀ V⁻¹ W) x = h - Wᵀ V⁻¹ g (Schur complement), and y = V⁻¹ (g -
+W x) follows block by block.
 """
 
 from typing import NamedTuple
@@ -16,7 +19,7 @@ import numpy as np
 from jax.ops import segment_sum
 from jaxtyping import Array, Float, Int
 
-from ..programs import traced
+from ..xla.programs import traced
 from . import normal_equations as normal, symmetric
 from .terms import Families, Linearised, Term, dimension, members
 
@@ -25,8 +28,9 @@ Vector = Float[Array, " kept"]
 
 
 class Blocks(NamedTuple):
-    """A family of blocks: its name, how many `members` it has, how many local parameters each of them, and where these
-    begin among all kept ones; None where the family is eliminated."""
+    """A family of blocks: its name, how many `members` it has, how many local
+    parameters each of them, and where these begin among all kept ones; None where the
+    family is eliminated."""
 
     name: str
     members: int
@@ -35,7 +39,8 @@ class Blocks(NamedTuple):
 
 
 class Layout(eqx.Module):
-    """Where the local parameters of every family stand, the kept ones behind one another."""
+    """Where the local parameters of every family stand, the kept ones behind one
+    another."""
 
     blocks: tuple[Blocks, ...] = eqx.field(static=True)
 
@@ -67,36 +72,68 @@ class Layout(eqx.Module):
         """The places of the parameters of these members among all kept ones."""
         _, _, size, begin = self[name]
         assert begin is not None
-        return begin + member[..., None] * size + jnp.expand_dims(jnp.arange(size), range(member.ndim))
+        return (
+            begin
+            + member[..., None] * size
+            + jnp.expand_dims(jnp.arange(size), range(member.ndim))
+        )
 
-    def divided(self, kept: Vector, eliminated: Float[Array, "block d"] | None) -> dict[str, Array]:
+    def divided(
+        self, kept: Vector, eliminated: Float[Array, "block d"] | None
+    ) -> dict[str, Array]:
         """All parameters by family, (member, d)."""
         out = {}
         for name, count, size, begin in self.blocks:
-            out[name] = eliminated if begin is None else kept[begin : begin + count * size].reshape(count, size)
+            out[name] = (
+                eliminated
+                if begin is None
+                else kept[begin : begin + count * size].reshape(count, size)
+            )
         return out
 
 
-def layout(families: Families, terms: tuple[Term, ...], eliminate: str | None) -> Layout:
-    """The `Layout` of these families. Raises ValueError for a name that there is not, a family without a condition, and
-    where a condition joins two eliminated blocks or nothing is left."""
+def layout(
+    families: Families, terms: tuple[Term, ...], eliminate: str | None
+) -> Layout:
+    """The `Layout` of these families. Raises ValueError for a name that there is not, a
+    family without a condition, and where a condition joins two eliminated blocks or
+    nothing is left."""
     touched = {name for term in terms for name, _ in term.touches}
     asked = touched if eliminate is None else touched | {eliminate}
     if unknown := asked - set(families):
-        raise ValueError(f"adjust: there are no parameters {sorted(unknown)}; there are {sorted(families)}")
+        raise ValueError(
+            f"adjust: there are no parameters {sorted(unknown)}; there are "
+            f"{sorted(families)}"
+        )
     if idle := set(families) - touched:
         raise ValueError(f"adjust: no condition touches the parameters {sorted(idle)}")
     for term in terms:
         for name, member in term.touches:
-            if not traced(member) and not np.all(np.isin(member, np.arange(members(families[name])))):
-                raise ValueError(f"adjust: a condition touches a member of {name!r} that is not there")
+            if not traced(member) and not np.all(
+                np.isin(member, np.arange(members(families[name])))
+            ):
+                raise ValueError(
+                    f"adjust: a condition touches a member of {name!r} that is not "
+                    "there"
+                )
         if sum(name == eliminate for name, _ in term.touches) > 1:
-            raise ValueError(f"adjust: a condition joins two blocks of {eliminate!r}, which cannot be eliminated then")
+            raise ValueError(
+                f"adjust: a condition joins two blocks of {eliminate!r}, which cannot "
+                "be eliminated then"
+            )
     if set(families) == {eliminate}:
-        raise ValueError(f"adjust: {eliminate!r} are all the parameters there are; one family has to be kept")
+        raise ValueError(
+            f"adjust: {eliminate!r} are all the parameters there are; one family has "
+            "to be kept"
+        )
     blocks, begin = [], 0
     for name, family in families.items():
-        block = Blocks(name, members(family), dimension(family), None if name == eliminate else begin)
+        block = Blocks(
+            name,
+            members(family),
+            dimension(family),
+            None if name == eliminate else begin,
+        )
         blocks.append(block)
         begin += 0 if name == eliminate else block.members * block.size
     return Layout(tuple(blocks))
@@ -111,25 +148,38 @@ class Sums(NamedTuple):
 
 
 class Normals(NamedTuple):
-    """The sums of the module's docstring: N, h, and those of the eliminated blocks, if there are any."""
+    """The sums of the module's docstring: N, h, and those of the eliminated blocks, if
+    there are any."""
 
     n: Matrix
     h: Vector
     eliminated: Sums | None
 
 
-def accumulate(layout: Layout, terms: tuple[Term, ...], parts: list[Linearised]) -> Normals:
+def accumulate(
+    layout: Layout, terms: tuple[Term, ...], parts: list[Linearised]
+) -> Normals:
     """The normal equations of terms that have been linearised."""
     dtype = parts[0].residuals.dtype
-    n, h = jnp.zeros((layout.count, layout.count), dtype), jnp.zeros(layout.count, dtype)
+    n, h = (
+        jnp.zeros((layout.count, layout.count), dtype),
+        jnp.zeros(layout.count, dtype),
+    )
     sums = None
     if layout.eliminated is not None:
         _, blocks, d, _ = layout.eliminated
-        sums = Sums(*(jnp.zeros((blocks, d, *more), dtype) for more in ((d,), (layout.count,), ())))
+        sums = Sums(
+            *(
+                jnp.zeros((blocks, d, *more), dtype)
+                for more in ((d,), (layout.count,), ())
+            )
+        )
     for term, part in zip(terms, parts, strict=True):
         own, kept = _divided(layout, term, part)
         for name, member, a in kept:
-            if layout[name].members == 1 and len(kept) == 1:  # all groups touch one block: one product of matrices
+            if (
+                layout[name].members == 1 and len(kept) == 1
+            ):  # all groups touch one block: one product of matrices
                 place = layout.places(name, jnp.zeros((), int))
                 n = n.at[jnp.ix_(place, place)].add(jnp.einsum("gmi,gmj->ij", a, a))
                 h = h.at[place].add(jnp.einsum("gmi,gm->i", a, part.residuals))
@@ -138,14 +188,19 @@ def accumulate(layout: Layout, terms: tuple[Term, ...], parts: list[Linearised])
             h = h.at[rows].add(jnp.einsum("gmi,gm->gi", a, part.residuals))
             for other, of_other, b in kept:
                 columns = layout.places(other, of_other)
-                n = n.at[rows[:, :, None], columns[:, None, :]].add(jnp.einsum("gmi,gmj->gij", a, b))
+                n = n.at[rows[:, :, None], columns[:, None, :]].add(
+                    jnp.einsum("gmi,gmj->gij", a, b)
+                )
         for _, member, a in own:
             sums = _with_blocks(layout, sums, part, member, a, kept)
     return Normals(n, h, sums)
 
 
-def _with_blocks(layout: Layout, sums: Sums | None, part: Linearised, member, a, kept) -> Sums:
-    """The sums, with those of a term that touches the eliminated blocks `member` with the columns `a`."""
+def _with_blocks(
+    layout: Layout, sums: Sums | None, part: Linearised, member, a, kept
+) -> Sums:
+    """The sums, with those of a term that touches the eliminated blocks `member` with
+    the columns `a`."""
     assert sums is not None
     v, w, g = sums
     v = v + segment_sum(jnp.einsum("gmi,gmj->gij", a, a), member, v.shape[0])
@@ -153,13 +208,19 @@ def _with_blocks(layout: Layout, sums: Sums | None, part: Linearised, member, a,
     rows = jnp.arange(a.shape[2])[None, :, None]
     for other, of_other, b in kept:
         columns = layout.places(other, of_other)[:, None]
-        w = w.at[member[:, None, None], rows, columns].add(jnp.einsum("gmi,gmj->gij", a, b))
+        w = w.at[member[:, None, None], rows, columns].add(
+            jnp.einsum("gmi,gmj->gij", a, b)
+        )
     return Sums(v, w, g)
 
 
 def _divided(layout: Layout, term: Term, part: Linearised) -> tuple[list, list]:
-    """The blocks that a term touches, as (family, members, columns): the eliminated ones, and the kept ones."""
-    touched = [(name, member, a) for (name, member), a in zip(term.touches, part.columns, strict=True)]
+    """The blocks that a term touches, as (family, members, columns): the eliminated
+    ones, and the kept ones."""
+    touched = [
+        (name, member, a)
+        for (name, member), a in zip(term.touches, part.columns, strict=True)
+    ]
     own = [entry for entry in touched if layout.is_eliminated(entry[0])]
     return own, [entry for entry in touched if not layout.is_eliminated(entry[0])]
 
@@ -173,8 +234,9 @@ class Carried(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """The normal matrix of the kept parameters, their step and their cofactors; the solution of the eliminated blocks,
-    if there are any; and what the parameters before each one leave of its diagonal (`pivots`)."""
+    """The normal matrix of the kept parameters, their step and their cofactors; the
+    solution of the eliminated blocks, if there are any; and what the parameters before
+    each one leave of its diagonal (`pivots`)."""
 
     normal_matrix: Matrix
     step: Vector
@@ -183,11 +245,17 @@ class Solution(NamedTuple):
     pivots: Float[Array, " some"]
 
 
-def solve(normals: Normals, constraint: tuple[Float[Array, "c kept"], Float[Array, " c"]] | None = None) -> Solution:
-    """The solution, where the kept parameters also fulfil C step = c, given as (C, c)."""
+def solve(
+    normals: Normals,
+    constraint: tuple[Float[Array, "c kept"], Float[Array, " c"]] | None = None,
+) -> Solution:
+    """The solution, where the kept parameters also fulfil C step = c, given as (C,
+    c)."""
     n, h, sums = normals
     diagonal = jnp.diagonal(n)
-    scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
+    scale = jnp.where(
+        diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0
+    )
     if sums is None:
         q, step, pivots = _kept(n, h, scale, constraint)
         return Solution(n, step, q, None, pivots)
@@ -197,18 +265,28 @@ def solve(normals: Normals, constraint: tuple[Float[Array, "c kept"], Float[Arra
     n, h = n - rows.T @ flat, h - flat.T @ sums.g.reshape(-1)
     q, step, pivots = _kept(n, h, scale, constraint)
     steps = jnp.einsum("eij,ej->ei", inverse, sums.g) - by_kept @ step
-    return Solution(n, step, q, Carried(steps, inverse, by_kept), jnp.concatenate([of_blocks, pivots]))
+    return Solution(
+        n,
+        step,
+        q,
+        Carried(steps, inverse, by_kept),
+        jnp.concatenate([of_blocks, pivots]),
+    )
 
 
-def _kept(n: Matrix, h: Vector, scale: Vector, constraint) -> tuple[Matrix, Vector, Float[Array, " some"]]:
-    """Cofactor, step and pivots of the kept parameters, all scaled by `scale` while they are calculated."""
+def _kept(
+    n: Matrix, h: Vector, scale: Vector, constraint
+) -> tuple[Matrix, Vector, Float[Array, " some"]]:
+    """Cofactor, step and pivots of the kept parameters, all scaled by `scale` while
+    they are calculated."""
     n = n * scale[:, None] * scale[None, :]
     h = h * scale
     if constraint is None:
         q, left = symmetric.inverse(n)
         step, pivots = q @ h, left * jnp.diagonal(n)
     else:
-        # N + CᵀC is regular where N is not but the constraints fix what it leaves open; with C x = c it changes nothing
+        # N + CᵀC is regular where N is not but the constraints fix what it leaves open;
+        # with C x = c it changes nothing
         rows = constraint[0] * scale[None, :]
         length = jnp.sqrt(jnp.sum(rows**2, axis=1))
         rows, c = rows / length[:, None], constraint[1] / length
@@ -222,38 +300,60 @@ def _kept(n: Matrix, h: Vector, scale: Vector, constraint) -> tuple[Matrix, Vect
     return q * scale[:, None] * scale[None, :], step * scale, pivots
 
 
-def _inverses(v: Float[Array, "block d d"]) -> tuple[Float[Array, "block d d"], Float[Array, " block"]]:
-    """The inverses of many small matrices, and the smallest pivot of each, element by element."""
+def _inverses(
+    v: Float[Array, "block d d"],
+) -> tuple[Float[Array, "block d d"], Float[Array, " block"]]:
+    """The inverses of many small matrices, and the smallest pivot of each, element by
+    element."""
     d = v.shape[1]
-    lower, pivot = normal.inverse([[v[:, i, j] for j in range(i + 1)] for i in range(d)])
-    rows = [jnp.stack([lower[max(i, j)][min(i, j)] for j in range(d)], axis=-1) for i in range(d)]
+    lower, pivot = normal.inverse(
+        [[v[:, i, j] for j in range(i + 1)] for i in range(d)]
+    )
+    rows = [
+        jnp.stack([lower[max(i, j)][min(i, j)] for j in range(d)], axis=-1)
+        for i in range(d)
+    ]
     return jnp.stack(rows, axis=1), pivot
 
 
-def cofactors(layout: Layout, solution: Solution, name: str) -> Float[Array, "member d d"]:
+def cofactors(
+    layout: Layout, solution: Solution, name: str
+) -> Float[Array, "member d d"]:
     """The cofactors of each block of a family."""
     block, blocks = layout[name], solution.eliminated
     if block.begin is not None or blocks is None:
         places = layout.places(name, jnp.arange(block.members))
         return solution.cofactor[places[:, :, None], places[:, None, :]]
-    return blocks.inverse + jnp.einsum("eik,kl,ejl->eij", blocks.by_kept, solution.cofactor, blocks.by_kept)
+    return blocks.inverse + jnp.einsum(
+        "eik,kl,ejl->eij", blocks.by_kept, solution.cofactor, blocks.by_kept
+    )
 
 
-def redundancies(layout: Layout, solution: Solution, term: Term, part: Linearised) -> Float[Array, "group m"]:
-    """The redundancy number of every residual, 1 - a Q aᵀ of its row a; zero where the group is not used."""
+def redundancies(
+    layout: Layout, solution: Solution, term: Term, part: Linearised
+) -> Float[Array, "group m"]:
+    """The redundancy number of every residual, 1 - a Q aᵀ of its row a; zero where the
+    group is not used."""
     own, kept = _divided(layout, term, part)
     product = lambda a, q, b: jnp.einsum("gmi,gij,gmj->gm", a, q, b)
     taken = jnp.zeros_like(part.residuals)
     for name, member, a in kept:
         for other, of_other, b in kept:
-            rows, columns = layout.places(name, member)[:, :, None], layout.places(other, of_other)[:, None]
+            rows, columns = (
+                layout.places(name, member)[:, :, None],
+                layout.places(other, of_other)[:, None],
+            )
             taken = taken + product(a, solution.cofactor[rows, columns], b)
     for name, member, a in own:
         taken = taken + product(a, cofactors(layout, solution, name)[member], a)
         assert solution.eliminated is not None
-        crossed = solution.eliminated.by_kept @ solution.cofactor  # of eliminated with kept parameters, times -1
+        crossed = (
+            solution.eliminated.by_kept @ solution.cofactor
+        )  # of eliminated with kept parameters, times -1
         rows = jnp.arange(layout[name].size)[None, :, None]
         for other, of_other, b in kept:
-            q = crossed[member[:, None, None], rows, layout.places(other, of_other)[:, None]]
+            q = crossed[
+                member[:, None, None], rows, layout.places(other, of_other)[:, None]
+            ]
             taken = taken - 2 * product(a, q, b)
     return jnp.where(term.mask[:, None], 1 - taken, 0.0)

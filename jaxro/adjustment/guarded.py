@@ -1,6 +1,7 @@
 """Arithmetic whose derivatives are finite where the value is zero or does not exist.
 
-What `where` selects away still meets its derivative backwards: 0 times an infinite or unknown one is NaN.
+What `where` selects away still meets its derivative backwards: 0 times an infinite or
+unknown one is NaN.
 """
 
 import jax.numpy as jnp
@@ -8,12 +9,14 @@ from jaxtyping import Array, ArrayLike, Bool
 
 
 def root(square: Array, there: Bool[Array, "..."] | bool = True) -> Array:
-    """The square root, zero where the square is not positive or not `there`; with finite derivatives. NaN of NaN."""
+    """The square root, zero where the square is not positive or not `there`; with
+    finite derivatives. NaN of NaN."""
     there = ~(square <= 0) & there
     return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
 
 
 def times(values: ArrayLike, unit: ArrayLike) -> Array:
-    """The product, NaN where the unit is, as sigma0 is without redundancy; with finite derivatives by the values."""
+    """The product, NaN where the unit is, as sigma0 is without redundancy; with finite
+    derivatives by the values."""
     known = ~jnp.isnan(unit)
     return jnp.where(known, jnp.asarray(values) * jnp.where(known, unit, 0.0), jnp.nan)

@@ -1,4 +1,5 @@
-"""The adjustment of several kinds of conditions between blocks of parameters, all at once."""
+"""The adjustment of several kinds of conditions between blocks of parameters, all at
+once."""
 
 from collections.abc import Callable
 
@@ -14,16 +15,27 @@ from .guarded import root, times
 from .losses import AbstractLoss
 from .m_estimates import spread
 from .results import RESULTS
-from .terms import Families, Linearised, Steps, Term, closed, linearised, moved, residuals, standard
+from .terms import (
+    Families,
+    Linearised,
+    Steps,
+    Term,
+    closed,
+    linearised,
+    moved,
+    residuals,
+    standard,
+)
 
 
 class JointAdjustment(eqx.Module):
     """A finished adjustment of blocks of parameters by several terms.
 
-    `parameters`: by the name of their family, as they were given. `normal_matrix` (what is left of it after the
-    elimination) and `cofactor`: of all local parameters of the kept families, in their order. `residuals` (whitened)
-    and `redundancy`: of each term, (group, m). `sigma0` is NaN without a degree of freedom. `pivot`: the least part of
-    the diagonal of a parameter that those before it leave.
+    `parameters`: by the name of their family, as they were given. `normal_matrix` (what
+    is left of it after the elimination) and `cofactor`: of all local parameters of the
+    kept families, in their order. `residuals` (whitened) and `redundancy`: of each
+    term, (group, m). `sigma0` is NaN without a degree of freedom. `pivot`: the least
+    part of the diagonal of a parameter that those before it leave.
     """
 
     parameters: dict[str, PyTree]
@@ -43,13 +55,20 @@ class JointAdjustment(eqx.Module):
         """The cofactors of the local parameters of each member of a family."""
         return elimination.cofactors(self.layout, self.solution, name)
 
-    def covariance(self, name: str, sigma0: ArrayLike | None = None) -> Float[Array, "member d d"]:
-        """sigma0² Q of each member of a family: a posteriori, or a priori with the sigma0 given."""
-        return times(self.cofactors(name), (self.sigma0 if sigma0 is None else jnp.asarray(sigma0)) ** 2)
+    def covariance(
+        self, name: str, sigma0: ArrayLike | None = None
+    ) -> Float[Array, "member d d"]:
+        """sigma0² Q of each member of a family: a posteriori, or a priori with the
+        sigma0 given."""
+        return times(
+            self.cofactors(name),
+            (self.sigma0 if sigma0 is None else jnp.asarray(sigma0)) ** 2,
+        )
 
 
 class Joint(eqx.Module):
-    """The residuals of all terms as a function of displacements of the families, and how to correct these."""
+    """The residuals of all terms as a function of displacements of the families, and
+    how to correct these."""
 
     terms: tuple[Term, ...]
     families: dict[str, PyTree]
@@ -75,9 +94,13 @@ class Joint(eqx.Module):
     def linearised(self, steps: Steps) -> list[Linearised]:
         return [linearised(term, self.families, steps) for term in self.terms]
 
-    def solved(self, steps: Steps, parts: list[Linearised], loss: AbstractLoss | None) -> Solution:
+    def solved(
+        self, steps: Steps, parts: list[Linearised], loss: AbstractLoss | None
+    ) -> Solution:
         """The solution of the normal equations with the weights of a loss."""
-        normals = elimination.accumulate(self.layout, self.terms, [_weighted(part, loss) for part in parts])
+        normals = elimination.accumulate(
+            self.layout, self.terms, [_weighted(part, loss) for part in parts]
+        )
         return elimination.solve(normals, self._constraint(steps))
 
     def _constraint(self, steps: Steps) -> tuple[Array, Array] | None:
@@ -86,10 +109,15 @@ class Joint(eqx.Module):
 
         def of_kept(kept):
             steps = self.layout.divided(kept, None)
-            families = {b.name: moved(self.families[b.name], steps[b.name]) for b in self.layout.kept}
+            families = {
+                b.name: moved(self.families[b.name], steps[b.name])
+                for b in self.layout.kept
+            }
             return jnp.atleast_1d(self.constraints(families))  # pyright: ignore[reportOptionalCall]
 
-        kept = jnp.concatenate([steps[block.name].reshape(-1) for block in self.layout.kept])
+        kept = jnp.concatenate(
+            [steps[block.name].reshape(-1) for block in self.layout.kept]
+        )
         return jax.jacrev(of_kept)(kept), of_kept(kept)
 
 
@@ -104,37 +132,66 @@ def adjust_jointly(
     max_steps: int = 30,
 ) -> JointAdjustment:
     """What `adjust` does for several terms."""
-    families = {name: jax.tree.map(jnp.asarray, family) for name, family in start.items()}
-    families = jax.lax.stop_gradient(families)  # the optimum does not depend on where it is sought
+    families = {
+        name: jax.tree.map(jnp.asarray, family) for name, family in start.items()
+    }
+    families = jax.lax.stop_gradient(
+        families
+    )  # the optimum does not depend on where it is sought
     layout = elimination.layout(families, terms, eliminate)
     terms = tuple(closed(term, families) for term in terms)
     joint = Joint(terms, families, layout, constraints, loss)
-    origin = {block.name: jnp.zeros((block.members, block.size), float) for block in layout.blocks}
+    origin = {
+        block.name: jnp.zeros((block.members, block.size), float)
+        for block in layout.blocks
+    }
     found = normal.minimise(joint, origin, solver, max_steps)
-    solved = {name: standard(moved(families[name], step)) for name, step in found.value.items()}
+    solved = {
+        name: standard(moved(families[name], step))
+        for name, step in found.value.items()
+    }
     at_solution = Joint(terms, solved, layout, constraints, loss)
-    return _read(at_solution, origin, found.stats["num_steps"], found.result == optx.RESULTS.successful)
+    return _read(
+        at_solution,
+        origin,
+        found.stats["num_steps"],
+        found.result == optx.RESULTS.successful,
+    )
 
 
-def _read(joint: Joint, steps: Steps, iterations: Int[Array, ""], converged: Bool[Array, ""]) -> JointAdjustment:
-    """Everything that follows from the linearisation at the solution, from which these steps are none."""
+def _read(
+    joint: Joint, steps: Steps, iterations: Int[Array, ""], converged: Bool[Array, ""]
+) -> JointAdjustment:
+    """Everything that follows from the linearisation at the solution, from which these
+    steps are none."""
     layout, terms, loss = joint.layout, joint.terms, joint.loss
     parts = joint.linearised(steps)
     weighted = joint.solved(steps, parts, loss)
     rows = jnp.concatenate([part.residuals.reshape(-1) for part in parts])
-    use = jnp.concatenate([jnp.repeat(t.mask, part.residuals.shape[1]) for t, part in zip(terms, parts, strict=True)])
+    use = jnp.concatenate(
+        [
+            jnp.repeat(t.mask, part.residuals.shape[1])
+            for t, part in zip(terms, parts, strict=True)
+        ]
+    )
     known = 0 if joint.constraints is None else joint._constraint(steps)[1].shape[0]  # pyright: ignore[reportOptionalSubscript]
     freedom = jnp.sum(use) - (layout.total - known)
     checked = freedom > 0
     solution = weighted
     if loss is None:
-        sigma0 = root(jnp.sum(rows**2) / jnp.where(checked, freedom, 1).astype(rows.dtype))
+        sigma0 = root(
+            jnp.sum(rows**2) / jnp.where(checked, freedom, 1).astype(rows.dtype)
+        )
     else:
-        sigma0, factor = spread(loss, rows, use.astype(rows.dtype), layout.total - known)
+        sigma0, factor = spread(
+            loss, rows, use.astype(rows.dtype), layout.total - known
+        )
         factor = jnp.where(checked, factor, 1.0)
         plain = joint.solved(steps, parts, None)
         blocks = plain.eliminated
-        blocks = None if blocks is None else blocks._replace(inverse=factor * blocks.inverse)
+        blocks = (
+            None if blocks is None else blocks._replace(inverse=factor * blocks.inverse)
+        )
         solution = plain._replace(cofactor=factor * plain.cofactor, eliminated=blocks)
     pivot = jnp.min(weighted.pivots)
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)
@@ -163,4 +220,6 @@ def _weighted(part: Linearised, loss: AbstractLoss | None) -> Linearised:
     if loss is None:
         return part
     weight = jnp.sqrt(loss.weight(part.residuals**2))
-    return Linearised(weight * part.residuals, tuple(weight[:, :, None] * a for a in part.columns))
+    return Linearised(
+        weight * part.residuals, tuple(weight[:, :, None] * a for a in part.columns)
+    )

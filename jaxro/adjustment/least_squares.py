@@ -2,10 +2,12 @@
 
     g(x, l_i + v_i) = 0  for every observation group i,    Σ v_iᵀ Q_i⁻¹ v_i = min.
 
-Each group is linearised by autodiff, B = dg/dl, and whitened by the Cholesky factor of its cofactor B Q Bᵀ; the sum of
-squares of the whitened residuals r_i = L_i⁻¹ g_i is minimised by optimistix and the finished solution is read: normal
-matrix, cofactors, redundancy, sigma0. Observation equations l = f(x) are the case g = f(x) - l. Conditions that are not
-linear in l are satisfied to first order in v (the second order is |v| over the radius of curvature).
+Each group is linearised by autodiff, B = dg/dl, and whitened by the Cholesky factor of
+its cofactor B Q Bᵀ; the sum of squares of the whitened residuals r_i = L_i⁻¹ g_i is
+minimised by optimistix and the finished solution is read: normal matrix, cofactors,
+redundancy, sigma0. Observation equations l = f(x) are the case g = f(x) - l. Conditions
+that are not linear in l are satisfied to first order in v (the second order is |v| over
+the radius of curvature).
 """
 
 from collections.abc import Callable, Sequence
@@ -18,8 +20,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from ..pointwise import pointwise
-from ..programs import part
+from ..xla.pointwise import pointwise
+from ..xla.programs import part
 from . import normal_equations as normal
 from .guarded import root, times
 from .joint import JointAdjustment, adjust_jointly
@@ -34,8 +36,9 @@ from .terms import Families, Term
 class Adjustment(eqx.Module):
     """A finished adjustment of p parameters from groups of m conditions each.
 
-    `residuals` are whitened: of the unit of sigma0, and dimensionless where the cofactors are true variances.
-    `cofactor` is that of the parameters (for `RelativePose`, of its five local parameters at the solution).
+    `residuals` are whitened: of the unit of sigma0, and dimensionless where the
+    cofactors are true variances. `cofactor` is that of the parameters (for
+    `RelativePose`, of its five local parameters at the solution).
     """
 
     parameters: PyTree
@@ -50,8 +53,11 @@ class Adjustment(eqx.Module):
     result: RESULTS
 
     def covariance(self, sigma0: ArrayLike | None = None) -> Float[Array, "p p"]:
-        """sigma0² Q: a posteriori, or a priori with the sigma0 given (1 where the cofactors are variances)."""
-        return times(self.cofactor, (self.sigma0 if sigma0 is None else jnp.asarray(sigma0)) ** 2)
+        """sigma0² Q: a posteriori, or a priori with the sigma0 given (1 where the
+        cofactors are variances)."""
+        return times(
+            self.cofactor, (self.sigma0 if sigma0 is None else jnp.asarray(sigma0)) ** 2
+        )
 
 
 @overload
@@ -96,29 +102,38 @@ def adjust(
     solver: optx.AbstractLeastSquaresSolver | None = None,
     max_steps: int = 30,
 ) -> Adjustment | JointAdjustment:
-    """Adjust parameters to measurements: Σ |L_i⁻¹ g(x, l_i)|² = min, or Σ rho of it with a robust loss.
+    """Adjust parameters to measurements: Σ |L_i⁻¹ g(x, l_i)|² = min, or Σ rho of it
+    with a robust loss.
 
-    `condition(parameters, observation)` of one group returns a number or m of them. `observations`: a pytree whose
-    leaves have the groups on the first axis; `cofactor`: its variances (relative to sigma0²), a tree that may end above
-    the leaves and then holds for all of them: numbers or one per group, None for what is free of error. `mask` selects
-    groups. `start`: `AbstractParameters`, or any pytree of numbers.
-    `prepare`: what all groups share, computed once; the condition then gets prepare(*arguments) for the parameters, of
-    their `arguments`.
-    `solver`: any optimistix least-squares solver; `GaussNewton()` if None.
+    `condition(parameters, observation)` of one group returns a number or m of them.
+    `observations`: a pytree whose leaves have the groups on the first axis; `cofactor`:
+    its variances (relative to sigma0²), a tree that may end above the leaves and then
+    holds for all of them: numbers or one per group, None for what is free of error.
+    `mask` selects groups. `start`: `AbstractParameters`, or any pytree of numbers.
+    `prepare`: what all groups share, computed once; the condition then gets
+    prepare(*arguments) for the parameters, of their `arguments`. `solver`: any
+    optimistix least-squares solver; `GaussNewton()` if None.
 
-    With a loss, normal matrix and redundancy carry the final weights rho'(r²); sigma0 is consistent for normal errors,
-    and sigma0² times `cofactor` is the sandwich covariance of the M-estimate (`m_estimates`), so that the cofactors are
-    not the inverse of the normal matrix. Derivatives of every field by the observations and cofactors are exact
-    (implicit function theorem). Failures are values of `result`, never exceptions.
+    With a loss, normal matrix and redundancy carry the final weights rho'(r²); sigma0
+    is consistent for normal errors, and sigma0² times `cofactor` is the sandwich
+    covariance of the M-estimate (`m_estimates`), so that the cofactors are not the
+    inverse of the normal matrix. Derivatives of every field by the observations and
+    cofactors are exact (implicit function theorem). Failures are values of `result`,
+    never exceptions.
 
-    Several kinds of conditions between many blocks of parameters (cameras, object points): `adjust(terms, start)` with
-    a list of `Term` in place of the condition, and with the families of blocks by name as `start`. `eliminate` names
-    the family with the most blocks, if no condition joins two of them; only its Schur complement is then inverted.
-    `constraints(parameters)`: numbers of the kept families that are to become zero, as the datum of a free network.
+    Several kinds of conditions between many blocks of parameters (cameras, object
+    points): `adjust(terms, start)` with a list of `Term` in place of the condition, and
+    with the families of blocks by name as `start`. `eliminate` names the family with
+    the most blocks, if no condition joins two of them; only its Schur complement is
+    then inverted. `constraints(parameters)`: numbers of the kept families that are to
+    become zero, as the datum of a free network.
     """
     if isinstance(condition, Term | Sequence):
         if any(given is not None for given in (observations, cofactor, mask, prepare)):
-            raise ValueError("adjust: observations, cofactors and masks are part of each `Term`; there is no `prepare`")
+            raise ValueError(
+                "adjust: observations, cofactors and masks are part of each `Term`; "
+                "there is no `prepare`"
+            )
         terms = (condition,) if isinstance(condition, Term) else tuple(condition)
         return adjust_jointly(
             terms,
@@ -130,37 +145,60 @@ def adjust(
             max_steps=max_steps,
         )
     if eliminate is not None or constraints is not None:
-        raise ValueError("adjust: `eliminate` and `constraints` are for terms; give `Term`s in place of the condition")
+        raise ValueError(
+            "adjust: `eliminate` and `constraints` are for terms; give `Term`s in "
+            "place of the condition"
+        )
     if as_parameters(start).count > normal.UNROLLED:
         measured = condition, prepare, observations, cofactor, mask
-        return _of_one_block(*measured, start, loss=loss, solver=solver, max_steps=max_steps)
+        return _of_one_block(
+            *measured, start, loss=loss, solver=solver, max_steps=max_steps
+        )
     groups = jax.tree.leaves(observations)[0].shape[0]
     if mask is None:
         mask = jnp.ones(groups, bool)
     dtype = jax.tree.leaves(start)[0].dtype
-    cofactor = jax.tree.map(lambda q: jnp.broadcast_to(jnp.asarray(q, dtype), (groups, *jnp.shape(q)[1:])), cofactor)
-    start = as_parameters(jax.lax.stop_gradient(start))  # the optimum does not depend on where it is sought
-    residuals = residuals_of(condition, prepare, start, observations, cofactor, mask, loss)
+    cofactor = jax.tree.map(
+        lambda q: jnp.broadcast_to(jnp.asarray(q, dtype), (groups, *jnp.shape(q)[1:])),
+        cofactor,
+    )
+    start = as_parameters(
+        jax.lax.stop_gradient(start)
+    )  # the optimum does not depend on where it is sought
+    residuals = residuals_of(
+        condition, prepare, start, observations, cofactor, mask, loss
+    )
     origin = (jnp.zeros((), dtype),) * start.count
-    solve = lambda origin, residuals: normal.minimise(residuals, origin, solver, max_steps)
+    solve = lambda origin, residuals: normal.minimise(
+        residuals, origin, solver, max_steps
+    )
     solution = part(solve)(origin, residuals)
     parameters = start.moved(solution.value).normalised()
     converged = solution.result == optx.RESULTS.successful
     at_solution = eqx.tree_at(
-        lambda r: (r.centre, r.loss), residuals, (parameters, None), is_leaf=lambda leaf: leaf is None
+        lambda r: (r.centre, r.loss),
+        residuals,
+        (parameters, None),
+        is_leaf=lambda leaf: leaf is None,
     )
     return read(at_solution, loss, solution.stats["num_steps"], converged)
 
 
-def _of_one_block(condition, prepare, observations, cofactor, mask, start, **options) -> Adjustment:
+def _of_one_block(
+    condition, prepare, observations, cofactor, mask, start, **options
+) -> Adjustment:
     """Many parameters, all of which every group touches, as one block."""
 
     def of_block(parameters, observation):
         arguments = as_parameters(parameters).arguments()
-        return condition(parameters if prepare is None else prepare(*arguments), observation)
+        return condition(
+            parameters if prepare is None else prepare(*arguments), observation
+        )
 
     term = Term(of_block, observations, cofactor, [("all", np.zeros((), int))], mask)
-    found = adjust_jointly((term,), {"all": jax.tree.map(lambda a: jnp.asarray(a)[None], start)}, **options)
+    found = adjust_jointly(
+        (term,), {"all": jax.tree.map(lambda a: jnp.asarray(a)[None], start)}, **options
+    )
     one = lambda a: a[:, 0] if a.shape[1] == 1 else a
     return Adjustment(
         parameters=jax.tree.map(lambda a: a[0], found.parameters["all"]),
@@ -176,8 +214,11 @@ def _of_one_block(condition, prepare, observations, cofactor, mask, start, **opt
     )
 
 
-def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged) -> Adjustment:
-    """Everything that follows from the linearisation at the solution, the centre of `residuals`."""
+def read(
+    residuals: Residuals, loss: AbstractLoss | None, iterations, converged
+) -> Adjustment:
+    """Everything that follows from the linearisation at the solution, the centre of
+    `residuals`."""
     p = residuals.centre.count
     origin = (jnp.zeros((), jax.tree.leaves(residuals.centre)[0].dtype),) * p
     linearised = residuals.linearised(origin)
@@ -190,11 +231,23 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
 
     def of_group(observation, cofactor, use):
         r, jacobian, weight = linearised(observation, cofactor, use)
-        white = r if weight is None else [e * jnp.sqrt(w) for e, w in zip(r, weight, strict=True)]
+        white = (
+            r
+            if weight is None
+            else [e * jnp.sqrt(w) for e, w in zip(r, weight, strict=True)]
+        )
         weight = reweighted(loss, r, weight)
-        taken = [normal.quadratic(q, [column[c] for column in jacobian]) for c in range(len(r))]
-        redundancy = [1 - (t if weight is None else weight[c] * t) for c, t in enumerate(taken)]
-        return [[jnp.where(use, entry, 0.0) for entry in entries] for entries in (white, redundancy)]
+        taken = [
+            normal.quadratic(q, [column[c] for column in jacobian])
+            for c in range(len(r))
+        ]
+        redundancy = [
+            1 - (t if weight is None else weight[c] * t) for c, t in enumerate(taken)
+        ]
+        return [
+            [jnp.where(use, entry, 0.0) for entry in entries]
+            for entries in (white, redundancy)
+        ]
 
     white, redundancy = pointwise(of_group, *groups)
     freedom = len(r) * number.astype(int) - p
@@ -207,7 +260,9 @@ def read(residuals: Residuals, loss: AbstractLoss | None, iterations, converged)
         use = jnp.tile(residuals.mask.astype(entries.dtype), len(white))
         sigma0, factor = spread(loss, entries, use, p)
         plain, *_ = normal.accumulate(r, jacobian, weight)
-        cofactor = jnp.where(checked, factor, 1.0) * normal.dense(normal.inverse(plain)[0])
+        cofactor = jnp.where(checked, factor, 1.0) * normal.dense(
+            normal.inverse(plain)[0]
+        )
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)
     result = RESULTS.where(pivot < normal.SINGULAR, RESULTS.rank_deficient, result)
     return Adjustment(

@@ -1,11 +1,14 @@
-"""Robust losses rho(s) of the squared whitened residual s = r², each with rho(s) = s + O(s²) at zero.
+"""Robust losses rho(s) of the squared whitened residual s = r², each with rho(s) = s +
+O(s²) at zero.
 
-A loss enters the adjustment as the transformed residual r sqrt(rho(r²)/r²), whose squares add up to the robust
-objective: optimum and implicit derivative are then both exact. The package's own solver reaches that optimum by steps
-with the weights rho'(r²) instead. `scale` is in units of the whitened residual, that is multiples of sigma, or mm where
-sigma is 1.
+A loss enters the adjustment as the transformed residual r sqrt(rho(r²)/r²), whose
+squares add up to the robust objective: optimum and implicit derivative are then both
+exact. The package's own solver reaches that optimum by steps with the weights rho'(r²)
+instead. `scale` is in units of the whitened residual, that is multiples of sigma, or mm
+where sigma is 1.
 
-Weights that belong to no loss in use serve the reweighting of `rejection.Reweighting` alone.
+Weights that belong to no loss in use serve the reweighting of `rejection.Reweighting`
+alone.
 """
 
 import abc
@@ -19,7 +22,8 @@ Values = Float[Array, "..."]
 
 
 class AbstractWeight(eqx.Module):
-    """The factor by which reweighted least squares multiplies the weight of an observation."""
+    """The factor by which reweighted least squares multiplies the weight of an
+    observation."""
 
     @abc.abstractmethod
     def weight(self, s: Values) -> Values:
@@ -27,7 +31,8 @@ class AbstractWeight(eqx.Module):
 
 
 class AbstractLoss(AbstractWeight):
-    """rho(s), and from it the weight rho'(s) of iteratively reweighted least squares."""
+    """rho(s), and from it the weight rho'(s) of iteratively reweighted least
+    squares."""
 
     scale: eqx.AbstractVar[float]
 
@@ -55,7 +60,9 @@ class Huber(AbstractLoss):
     def rho(self, s):
         k2 = self.scale**2
         outside = s > k2
-        return jnp.where(outside, 2 * self.scale * jnp.sqrt(jnp.where(outside, s, 1.0)) - k2, s)
+        return jnp.where(
+            outside, 2 * self.scale * jnp.sqrt(jnp.where(outside, s, 1.0)) - k2, s
+        )
 
 
 class SoftL1(AbstractLoss):
@@ -64,7 +71,9 @@ class SoftL1(AbstractLoss):
     scale: float = 1.0
 
     def rho(self, s):
-        return 2 * s / (1 + jnp.sqrt(1 + s / self.scale**2))  # without a difference of nearly equal numbers
+        return (
+            2 * s / (1 + jnp.sqrt(1 + s / self.scale**2))
+        )  # without a difference of nearly equal numbers
 
 
 class Cauchy(AbstractLoss):
@@ -96,7 +105,8 @@ class Tukey(AbstractLoss):
 
 
 class LeastAbsolute(AbstractWeight):
-    """k / sqrt(s) outside the scale k, 1 inside: Σ |r| = min, with a small k against infinite weights."""
+    """k / sqrt(s) outside the scale k, 1 inside: Σ |r| = min, with a small k against
+    infinite weights."""
 
     scale: float = 0.1
 
@@ -105,22 +115,32 @@ class LeastAbsolute(AbstractWeight):
 
 
 class Danish(AbstractWeight):
-    """1 inside the scale k, exp(-factor (sqrt(s)/k)^power) outside (Krarup, Juhl and Kubik 1980; k = 2 or 3)."""
+    """1 inside the scale k, exp(-factor (sqrt(s)/k)^power) outside (Krarup, Juhl and
+    Kubik 1980; k = 2 or 3)."""
 
     scale: float = 2.0
     factor: float = 0.05
     power: float = 3.0
 
     def weight(self, s):
-        return jnp.where(s > self.scale**2, jnp.exp(-self.factor * (s / self.scale**2) ** (self.power / 2)), 1.0)
+        return jnp.where(
+            s > self.scale**2,
+            jnp.exp(-self.factor * (s / self.scale**2) ** (self.power / 2)),
+            1.0,
+        )
 
 
 class IggThree(AbstractWeight):
-    """1 inside k0, (k0/|r|) ((k1 - |r|) / (k1 - k0))² up to k1, zero beyond (IGG III, Yang 1994)."""
+    """1 inside k0, (k0/|r|) ((k1 - |r|) / (k1 - k0))² up to k1, zero beyond (IGG III,
+    Yang 1994)."""
 
     scale: float = 1.5
     last: float = 4.5
 
     def weight(self, s):
         r = jnp.sqrt(jnp.maximum(s, self.scale**2))
-        return self.scale / r * (jnp.maximum(self.last - r, 0.0) / (self.last - self.scale)) ** 2
+        return (
+            self.scale
+            / r
+            * (jnp.maximum(self.last - r, 0.0) / (self.last - self.scale)) ** 2
+        )

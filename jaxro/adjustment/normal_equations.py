@@ -1,8 +1,10 @@
-"""Small normal equations, element by element, and the Gauss-Newton solver built on them.
+"""Small normal equations, element by element, and the Gauss-Newton solver built on
+them.
 
-For p parameters the p(p+1)/2 + p + 1 sums N = JᵀJ, h = Jᵀr and rᵀr are accumulated by one variadic reduction over the
-residuals, so that no Jacobian is ever stored, and the system is solved by an unrolled Cholesky factorisation. Under
-`vmap` every operation is element-wise over the pairs: no LAPACK (which deadlocks from two threads) and no batched
+For p parameters the p(p+1)/2 + p + 1 sums N = JᵀJ, h = Jᵀr and rᵀr are accumulated by
+one variadic reduction over the residuals, so that no Jacobian is ever stored, and the
+system is solved by an unrolled Cholesky factorisation. Under `vmap` every operation is
+element-wise over the pairs: no LAPACK (which deadlocks from two threads) and no batched
 matrix product. Above `UNROLLED` parameters `symmetric` takes over.
 """
 
@@ -19,8 +21,8 @@ from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..programs import part, stage
-from ..reductions import sums
+from ..xla.programs import part, stage
+from ..xla.reductions import sums
 from . import symmetric
 
 Scalar = Float[Array, ""]
@@ -30,53 +32,71 @@ Lower = Sequence[Sequence[Any]]
 """Lower triangle of a symmetric matrix: row i has i + 1 entries."""
 
 UNROLLED = 12
-"""Largest number of parameters that is unrolled: beyond it the compiled program grows faster than it runs."""
+"""Largest number of parameters that is unrolled: beyond it the compiled program grows
+faster than it runs."""
 
 SINGULAR = 1e-12
 """Relative pivot below which a parameter counts as undetermined by those before it."""
 
 LEAST = 0.4
-"""Power of the smallest number of a type that is the smallest pivot: 1e-123 in double precision."""
+"""Power of the smallest number of a type that is the smallest pivot: 1e-123 in double
+precision."""
 
 ROUNDING = 1e-10
 """Relative size of steps that have no use any more where they do not fall."""
 
 
-def accumulate(r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None, *more: Array) -> tuple[Any, ...]:
-    """N = JᵀWJ, h = JᵀWr and rᵀWr, from residuals and columns that may come in several arrays each, and in the same
-    pass the sums of more arrays."""
+def accumulate(
+    r: Columns, jacobian: Sequence[Columns], weight: Columns | None = None, *more: Array
+) -> tuple[Any, ...]:
+    """N = JᵀWJ, h = JᵀWr and rᵀWr, from residuals and columns that may come in several
+    arrays each, and in the same pass the sums of more arrays."""
     p = len(jacobian)
     parts = []
     for c, residual in enumerate(r):
         column = [jacobian[k][c] for k in range(p)]
-        weighted = [*column, residual] if weight is None else [weight[c] * a for a in (*column, residual)]
+        weighted = (
+            [*column, residual]
+            if weight is None
+            else [weight[c] * a for a in (*column, residual)]
+        )
         products = [weighted[i] * column[j] for i in range(p) for j in range(i + 1)]
         products += [weighted[p] * a for a in column] + [weighted[p] * residual]
         parts.append(sums((*products, *(more if c == 0 else ()))))
-    total = [sum(part[1:], part[0]) for part in itertools.zip_longest(*parts, fillvalue=0)]
+    total = [
+        sum(part[1:], part[0]) for part in itertools.zip_longest(*parts, fillvalue=0)
+    ]
     n = [[total.pop(0) for _ in range(i + 1)] for i in range(p)]
     return n, total[:p], *total[p:]
 
 
 def columns(residual: Callable, x: Scalars) -> tuple[Columns, list[Columns], None]:
-    """Residuals r(x) and the columns dr/dx_k of any residual function, by linearising it once."""
+    """Residuals r(x) and the columns dr/dx_k of any residual function, by linearising
+    it once."""
     r, push = jax.linearize(lambda *y: residual(y), *x)
     unit = jnp.eye(len(x), dtype=r.dtype)
-    return [r], [[push(*(unit[k, i] for i in range(len(x))))] for k in range(len(x))], None
+    return (
+        [r],
+        [[push(*(unit[k, i] for i in range(len(x))))] for k in range(len(x))],
+        None,
+    )
 
 
 def slopes(function: Callable, x: Scalars) -> tuple[Any, list[Any]]:
-    """function(*x) and its derivatives by x_k, one after the other, as `directional` has them."""
+    """function(*x) and its derivatives by x_k, one after the other, as `directional`
+    has them."""
     value, derivatives = None, []
     for k, at in enumerate(x):
-        value, slope = directional(lambda t, k=k: function(*x[:k], t, *x[k + 1 :]), (at,), (jnp.ones_like(at),))
+        value, slope = directional(
+            lambda t, k=k: function(*x[:k], t, *x[k + 1 :]), (at,), (jnp.ones_like(at),)
+        )
         derivatives.append(slope)
     return value, derivatives
 
 
 def directional(function: Callable, at: tuple, direction: tuple) -> tuple[Any, Any]:
-    """function(*at) and its derivative along a direction, with None for what does not depend on what moves: products
-    with zeros a compiler has to keep."""
+    """function(*at) and its derivative along a direction, with None for what does not
+    depend on what moves: products with zeros a compiler has to keep."""
     still: list[bool] = []
     structure: list[Any] = []
     watched = jax.custom_jvp(lambda *leaves: leaves)
@@ -88,28 +108,42 @@ def directional(function: Callable, at: tuple, direction: tuple) -> tuple[Any, A
     def flat(*x):
         leaves, tree = jax.tree.flatten(function(*x))
         structure.append(tree)
-        # what moves goes through as well, so that it is this derivative that is watched and none around it
+        # what moves goes through as well, so that it is this derivative that is watched
+        # and none around it
         return watched(*leaves, *jax.tree.leaves(x))[: len(leaves)]
 
     watched.defjvp(seen, symbolic_zeros=True)
     value, slope = jax.jvp(flat, at, direction)
-    moving = [None if zero else s for zero, s in zip(still, slope, strict=False)]  # those that move come after
-    return jax.tree.unflatten(structure[0], value), jax.tree.unflatten(structure[0], moving)
+    moving = [
+        None if zero else s for zero, s in zip(still, slope, strict=False)
+    ]  # those that move come after
+    return jax.tree.unflatten(structure[0], value), jax.tree.unflatten(
+        structure[0], moving
+    )
 
 
 def inner(a: PyTree, b: PyTree) -> Any:
-    """Sum of the products of the entries of two trees, numbers or arrays; None in the second is zero."""
-    of = lambda x, y: None if y is None else x * y if jnp.ndim(x) == 0 else jnp.sum(x * y)
+    """Sum of the products of the entries of two trees, numbers or arrays; None in the
+    second is zero."""
+    of = lambda x, y: (
+        None if y is None else x * y if jnp.ndim(x) == 0 else jnp.sum(x * y)
+    )
     products = jax.tree.leaves(jax.tree.map(of, a, b))
-    return sum(products[1:], products[0]) if products else jnp.zeros((), jnp.result_type(*jax.tree.leaves(a)))
+    return (
+        sum(products[1:], products[0])
+        if products
+        else jnp.zeros((), jnp.result_type(*jax.tree.leaves(a)))
+    )
 
 
 def cholesky(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
-    """L with N = L Lᵀ, the *inverses* of its diagonal in place of the diagonal, and the smallest relative pivot.
+    """L with N = L Lᵀ, the *inverses* of its diagonal in place of the diagonal, and the
+    smallest relative pivot.
 
-    The relative pivot of a parameter is the part of its diagonal that those before it leave over; pivots below the
-    rounding level are lifted to it, so that a singular system gives a large but finite solution; where all is zero, to
-    LEAST of the type, so that the squares of the inverse and its derivatives are finite, too.
+    The relative pivot of a parameter is the part of its diagonal that those before it
+    leave over; pivots below the rounding level are lifted to it, so that a singular
+    system gives a large but finite solution; where all is zero, to LEAST of the type,
+    so that the squares of the inverse and its derivatives are finite, too.
     """
     factor: list[list[Scalar]] = []
     smallest = jnp.ones_like(n[0][0])
@@ -122,7 +156,9 @@ def cholesky(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
             if i > j:
                 new.append(s * factor[j][j])
             else:
-                floor = jnp.finfo(s.dtype).eps * row[i] + jnp.finfo(s.dtype).tiny ** LEAST
+                floor = (
+                    jnp.finfo(s.dtype).eps * row[i] + jnp.finfo(s.dtype).tiny ** LEAST
+                )
                 smallest = jnp.minimum(smallest, s / (row[i] + jnp.finfo(s.dtype).tiny))
                 new.append(lax.rsqrt(jnp.maximum(s, floor)))
         factor.append(new)
@@ -130,7 +166,8 @@ def cholesky(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
 
 
 def substitute(factor: Lower, h: Scalars) -> list[Any]:
-    """N⁻¹ h by forward and back substitution; of many right-hand sides at once where the entries of h are arrays."""
+    """N⁻¹ h by forward and back substitution; of many right-hand sides at once where
+    the entries of h are arrays."""
     x: list[Any] = []
     for i, row in enumerate(factor):
         s = h[i]
@@ -146,14 +183,20 @@ def substitute(factor: Lower, h: Scalars) -> list[Any]:
 
 
 def quadratic(q: Lower, a: Sequence[Any]) -> Any:
-    """aᵀ Q a of a symmetric matrix, given by its lower triangle; of many a at once where their entries are arrays."""
-    return sum(a[i] * sum((1.0 if i == j else 2.0) * q[i][j] * a[j] for j in range(i + 1)) for i in range(len(a)))
+    """aᵀ Q a of a symmetric matrix, given by its lower triangle; of many a at once
+    where their entries are arrays."""
+    return sum(
+        a[i] * sum((1.0 if i == j else 2.0) * q[i][j] * a[j] for j in range(i + 1))
+        for i in range(len(a))
+    )
 
 
 def dense(n: Lower) -> Float[Array, "p p"]:
     """The symmetric matrix as an array."""
     p = len(n)
-    return jnp.stack([jnp.stack([n[max(i, j)][min(i, j)] for j in range(p)]) for i in range(p)])
+    return jnp.stack(
+        [jnp.stack([n[max(i, j)][min(i, j)] for j in range(p)]) for i in range(p)]
+    )
 
 
 def solve(n: Lower, h: Scalars) -> list[Scalar]:
@@ -163,8 +206,11 @@ def solve(n: Lower, h: Scalars) -> list[Scalar]:
     return stage(lambda n, h: substitute(cholesky(n)[0], h))(n, h)
 
 
-def correction(linear: tuple[Columns, Sequence[Columns], Columns | None]) -> tuple[Scalar, ...]:
-    """What Gauss-Newton subtracts from the parameters, from residuals, columns and weights."""
+def correction(
+    linear: tuple[Columns, Sequence[Columns], Columns | None],
+) -> tuple[Scalar, ...]:
+    """What Gauss-Newton subtracts from the parameters, from residuals, columns and
+    weights."""
     n, h, _ = accumulate(*linear)
     return tuple(solve(n, h))
 
@@ -177,18 +223,24 @@ def inverse(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
         return [[full[i, j] for j in range(i + 1)] for i in range(p)], jnp.min(pivots)
     factor, pivot = cholesky(n)
     zero, one = jnp.zeros_like(n[0][0]), jnp.ones_like(n[0][0])
-    solved = [substitute(factor, [one if i == k else zero for i in range(p)]) for k in range(p)]
+    solved = [
+        substitute(factor, [one if i == k else zero for i in range(p)])
+        for k in range(p)
+    ]
     return [[solved[j][i] for j in range(i + 1)] for i in range(p)], pivot
 
 
 class GaussNewton(optx.AbstractLeastSquaresSolver):
-    """Gauss-Newton for a few parameters; its loop carries the parameters and two step sizes, nothing else.
+    """Gauss-Newton for a few parameters; its loop carries the parameters and two step
+    sizes, nothing else.
 
-    `args` that know their own correction, and how a step follows others (`residuals.Residuals`, `joint.Joint`), are
-    asked for it; any other residual function is linearised. Ends when the *next* step, predicted from the last two, is
-    below atol + rtol |x|, or below ROUNDING in their place if steps no longer fall: they are rounding errors then.
-    `max_step` bounds the largest component of a step (0.5 rad for orientations, where a
-    longer one leaves the range of the linearisation).
+    `args` that know their own correction, and how a step follows others
+    (`residuals.Residuals`, `joint.Joint`), are asked for it; any other residual
+    function is linearised. Ends when the *next* step, predicted from the last two, is
+    below atol + rtol |x|, or below ROUNDING in their place if steps no longer fall:
+    they are rounding errors then. `max_step` bounds the largest component of a step
+    (0.5 rad for orientations, where a longer one leaves the range of the
+    linearisation).
     """
 
     rtol: float = 1e-12
@@ -204,14 +256,22 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
         known = hasattr(args, "correction")
         delta = args.correction(y) if known else _correction(fn, y, args)
         longest = _largest(delta)
-        shrink = jnp.minimum(1.0, self.max_step / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny))
+        shrink = jnp.minimum(
+            1.0, self.max_step / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny)
+        )
         taken = jax.tree.map(lambda d: -shrink * d, delta)
         moved = args.further(y, taken) if known else jax.tree.map(jnp.add, y, taken)
         largest = _largest(moved)
         size = longest / (self.atol + self.rtol * largest)
         previous = state[1]
-        ratio = jnp.where(previous > 0, jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)), 1.0)
-        rounding = (previous > 0) & (ratio >= 1)  # a first step tells nothing of how they fall
+        ratio = jnp.where(
+            previous > 0,
+            jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)),
+            1.0,
+        )
+        rounding = (previous > 0) & (
+            ratio >= 1
+        )  # a first step tells nothing of how they fall
         predicted = size * jnp.where(rounding, min(1.0, self.atol / ROUNDING), ratio)
         return moved, (predicted, size), None
 
@@ -229,14 +289,20 @@ def _correction(fn: Callable, y: PyTree, args: PyTree) -> PyTree:
         flat, unravel = ravel_pytree(y)
         residual = lambda flat: ravel_pytree(fn(unravel(flat), args)[0])[0]
         jacobian = jax.jacfwd(residual)(flat)
-        return unravel(symmetric.inverse(jacobian.T @ jacobian).matrix @ (jacobian.T @ residual(flat)))
+        return unravel(
+            symmetric.inverse(jacobian.T @ jacobian).matrix
+            @ (jacobian.T @ residual(flat))
+        )
     residual = lambda *x: ravel_pytree(fn(jax.tree.unflatten(structure, x), args)[0])[0]
     return jax.tree.unflatten(structure, correction(columns(residual, leaves)))
 
 
 def _largest(tree: PyTree) -> Scalar:
     """The largest absolute value of the leaves, numbers or arrays."""
-    leaves = [jnp.abs(a) if jnp.ndim(a) == 0 else jnp.max(jnp.abs(a)) for a in jax.tree.leaves(tree)]
+    leaves = [
+        jnp.abs(a) if jnp.ndim(a) == 0 else jnp.max(jnp.abs(a))
+        for a in jax.tree.leaves(tree)
+    ]
     largest = leaves[0] * 0
     for leaf in leaves:
         largest = jnp.maximum(largest, leaf)
@@ -244,7 +310,8 @@ def _largest(tree: PyTree) -> Scalar:
 
 
 class SmallCholesky(lx.AbstractLinearSolver):
-    """The solution of the positive definite system of implicit differentiation, as a lineax solver."""
+    """The solution of the positive definite system of implicit differentiation, as a
+    lineax solver."""
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
         return operator.as_matrix()
@@ -255,7 +322,10 @@ class SmallCholesky(lx.AbstractLinearSolver):
         if p > UNROLLED:
             x = symmetric.inverse((state + state.T) / 2).matrix @ flat
         else:
-            lower = [[(state[i, j] + state[j, i]) / 2 for j in range(i + 1)] for i in range(p)]
+            lower = [
+                [(state[i, j] + state[j, i]) / 2 for j in range(i + 1)]
+                for i in range(p)
+            ]
             x = jnp.stack(solve(lower, [flat[i] for i in range(p)]))
         # lineax would stop the whole batch for one pair without a derivative
         return unravel(jnp.where(jnp.isfinite(x), x, 0.0)), lx.RESULTS.successful, {}
@@ -270,8 +340,14 @@ class SmallCholesky(lx.AbstractLinearSolver):
         return True
 
 
-def minimise(residuals: Any, origin: PyTree, solver: optx.AbstractLeastSquaresSolver | None, max_steps: int) -> Any:
-    """The optimistix solution for `residuals.Residuals` or `joint.Joint`, differentiable by all that these hold."""
+def minimise(
+    residuals: Any,
+    origin: PyTree,
+    solver: optx.AbstractLeastSquaresSolver | None,
+    max_steps: int,
+) -> Any:
+    """The optimistix solution for `residuals.Residuals` or `joint.Joint`,
+    differentiable by all that these hold."""
     return optx.least_squares(
         lambda x, residuals: residuals(x),
         GaussNewton() if solver is None else solver,
@@ -283,11 +359,23 @@ def minimise(residuals: Any, origin: PyTree, solver: optx.AbstractLeastSquaresSo
     )
 
 
-def steps(residuals: Any, x: tuple[Scalar, ...], count: int, max_step: float) -> tuple[Scalar, ...]:
-    """A fixed number of Gauss-Newton steps on `residuals.Residuals`, for starts that need no convergence test."""
+def steps(
+    residuals: Any, x: tuple[Scalar, ...], count: int, max_step: float
+) -> tuple[Scalar, ...]:
+    """A fixed number of Gauss-Newton steps on `residuals.Residuals`, for starts that
+    need no convergence test."""
     solver = GaussNewton(max_step=max_step)
 
     def body(_, x):
-        return solver.step(lambda x, residuals: (residuals(x), None), x, residuals, {}, (x[0], x[0]), frozenset())[0]
+        return solver.step(
+            lambda x, residuals: (residuals(x), None),
+            x,
+            residuals,
+            {},
+            (x[0], x[0]),
+            frozenset(),
+        )[0]
 
-    return part(lambda x: body(0, x) if count == 1 else lax.fori_loop(0, count, body, x))(x)
+    return part(
+        lambda x: body(0, x) if count == 1 else lax.fori_loop(0, count, body, x)
+    )(x)

@@ -18,8 +18,9 @@ Step = tuple[Float[Array, "..."], ...]
 class AbstractParameters(eqx.Module):
     """Unknowns with a way of their own to move: a rotation, say, which is no sum.
 
-    A step has `count` numbers, the local parameters at the present place. A condition sees the parameters themselves;
-    where the adjustment is given `prepare`, that sees their `arguments`.
+    A step has `count` numbers, the local parameters at the present place. A condition
+    sees the parameters themselves; where the adjustment is given `prepare`, that sees
+    their `arguments`.
     """
 
     @property
@@ -40,7 +41,8 @@ class AbstractParameters(eqx.Module):
         return (self,)
 
     def slopes(self, function: Callable, x: Step) -> tuple[Any, list[Any]]:
-        """function(*arguments) of the parameters moved by x, and its derivatives along `count` directions there."""
+        """function(*arguments) of the parameters moved by x, and its derivatives along
+        `count` directions there."""
         return slopes(lambda *x: function(*self.moved(x).arguments()), x)
 
     def further(self, x: Step, step: Step) -> Step:
@@ -62,7 +64,14 @@ class Numbers(AbstractParameters):
         rest, out = list(step), []
         for leaf in leaves:
             size = jnp.size(leaf)
-            out.append(leaf + (rest[0] if jnp.ndim(leaf) == 0 else jnp.stack(rest[:size]).reshape(jnp.shape(leaf))))
+            out.append(
+                leaf
+                + (
+                    rest[0]
+                    if jnp.ndim(leaf) == 0
+                    else jnp.stack(rest[:size]).reshape(jnp.shape(leaf))
+                )
+            )
             rest = rest[size:]
         return Numbers(jax.tree.unflatten(structure, out))
 

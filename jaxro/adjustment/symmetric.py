@@ -1,6 +1,7 @@
 """Inverses of symmetric matrices of hundreds of rows, in plain JAX.
 
-LAPACK called from two threads at once can wait for itself for ever, and `jnp.linalg` calls it.
+LAPACK called from two threads at once can wait for itself for ever, and `jnp.linalg`
+calls it.
 """
 
 from typing import NamedTuple
@@ -10,30 +11,36 @@ from jax import lax
 from jaxtyping import Array, Float
 
 BLOCK = 32
-"""Rows that are swept together: the rest of the matrix is then changed by one product of matrices."""
+"""Rows that are swept together: the rest of the matrix is then changed by one product
+of matrices."""
 
 
 class Inverse(NamedTuple):
-    """The inverse of a positive definite matrix, and the relative pivot of each row: the part of its diagonal that the
-    rows before it leave. Where one is near zero the matrix is singular, and the inverse large but finite."""
+    """The inverse of a positive definite matrix, and the relative pivot of each row:
+    the part of its diagonal that the rows before it leave. Where one is near zero the
+    matrix is singular, and the inverse large but finite."""
 
     matrix: Float[Array, "p p"]
     pivots: Float[Array, " p"]
 
 
 def inverse(matrix: Float[Array, "p p"]) -> Inverse:
-    """The inverse of a positive definite matrix by sweeps (Goodnight 1979), its diagonal scaled to 1 before."""
+    """The inverse of a positive definite matrix by sweeps (Goodnight 1979), its
+    diagonal scaled to 1 before."""
     diagonal = jnp.diagonal(matrix)
     scale = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     rows = matrix.shape[0]
     size = min(BLOCK, rows)
     missing = -rows % size
     scaled = matrix * scale[:, None] * scale[None, :]
-    scaled = jnp.pad(scaled, (0, missing)) + jnp.diag(jnp.where(jnp.arange(rows + missing) >= rows, 1.0, 0.0))
+    scaled = jnp.pad(scaled, (0, missing)) + jnp.diag(
+        jnp.where(jnp.arange(rows + missing) >= rows, 1.0, 0.0)
+    )
     ones = jnp.ones(rows + missing, matrix.dtype)
 
     def sweep(k, state):
-        """Rows and columns of one block exchanged: [[A, B], [Bᵀ, C]] to [[-A⁻¹, A⁻¹ B], [Bᵀ A⁻¹, C - Bᵀ A⁻¹ B]]."""
+        """Rows and columns of one block exchanged: [[A, B], [Bᵀ, C]] to [[-A⁻¹, A⁻¹ B],
+        [Bᵀ A⁻¹, C - Bᵀ A⁻¹ B]]."""
         whole, pivots = state
         begin = k * size
         rows_of_block = lax.dynamic_slice(whole, (begin, 0), (size, whole.shape[1]))
@@ -47,7 +54,9 @@ def inverse(matrix: Float[Array, "p p"]) -> Inverse:
         return rest, lax.dynamic_update_slice(pivots, left, (begin,))
 
     swept, pivots = lax.fori_loop(0, scaled.shape[0] // size, sweep, (scaled, ones))
-    return Inverse(-swept[:rows, :rows] * scale[:, None] * scale[None, :], pivots[:rows])
+    return Inverse(
+        -swept[:rows, :rows] * scale[:, None] * scale[None, :], pivots[:rows]
+    )
 
 
 def _small_inverse(matrix: Float[Array, "b b"]) -> Inverse:
@@ -59,8 +68,17 @@ def _small_inverse(matrix: Float[Array, "b b"]) -> Inverse:
         left = whole[k, k]
         row = whole[k] / jnp.maximum(left, floor)
         rest = whole - whole[:, k][:, None] * row[None, :]
-        rest = rest.at[k].set(row).at[:, k].set(row).at[k, k].set(-1 / jnp.maximum(left, floor))
+        rest = (
+            rest.at[k]
+            .set(row)
+            .at[:, k]
+            .set(row)
+            .at[k, k]
+            .set(-1 / jnp.maximum(left, floor))
+        )
         return rest, pivots.at[k].set(left)
 
-    swept, pivots = lax.fori_loop(0, matrix.shape[0], sweep, (matrix, jnp.ones_like(matrix[0])))
+    swept, pivots = lax.fori_loop(
+        0, matrix.shape[0], sweep, (matrix, jnp.ones_like(matrix[0]))
+    )
     return Inverse(-swept, pivots)

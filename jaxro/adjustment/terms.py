@@ -1,7 +1,8 @@
 """Conditions of several kinds between blocks of parameters and measurements.
 
-A block is a member of a family: one of all cameras, one of all object points. A `Term` is one kind of condition and
-what is measured for it; each of its groups touches a few blocks. Only the derivatives by these are ever computed.
+A block is a member of a family: one of all cameras, one of all object points. A `Term`
+is one kind of condition and what is measured for it; each of its groups touches a few
+blocks. Only the derivatives by these are ever computed.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +18,8 @@ from .parameters import AbstractParameters, as_parameters
 from .residuals import discrepancy, whitened
 
 Families = Mapping[str, Any]
-"""Parameters by the name of their family: `AbstractParameters` or trees of numbers, members on the first axis."""
+"""Parameters by the name of their family: `AbstractParameters` or trees of numbers,
+members on the first axis."""
 
 Steps = dict[str, Float[Array, "member d"]]
 """A displacement of every member of every family."""
@@ -26,9 +28,9 @@ Steps = dict[str, Float[Array, "member d"]]
 class Term(eqx.Module):
     """One kind of condition: g(blocks, l + v) = 0 for each of its groups.
 
-    `condition(*blocks, observation)` of one group returns a number or m of them. `touches`: for each block that it is
-    called with, the family and the member of every group, (group,). `observations`, `cofactor`, `mask`: as in
-    `adjust`.
+    `condition(*blocks, observation)` of one group returns a number or m of them.
+    `touches`: for each block that it is called with, the family and the member of every
+    group, (group,). `observations`, `cofactor`, `mask`: as in `adjust`.
     """
 
     condition: Callable
@@ -48,25 +50,34 @@ class Term(eqx.Module):
         self.condition = condition
         self.observations = jax.tree.map(jnp.asarray, observations)
         groups = jax.tree.leaves(self.observations)[0].shape[0]
-        self.touches = tuple((name, jnp.broadcast_to(jnp.asarray(member), (groups,))) for name, member in touches)
+        self.touches = tuple(
+            (name, jnp.broadcast_to(jnp.asarray(member), (groups,)))
+            for name, member in touches
+        )
         self.mask = jnp.ones(groups, bool) if mask is None else jnp.asarray(mask)
-        every = lambda q: jnp.broadcast_to(jnp.asarray(q, float), (groups, *jnp.shape(q)[1:]))
+        every = lambda q: jnp.broadcast_to(
+            jnp.asarray(q, float), (groups, *jnp.shape(q)[1:])
+        )
         self.cofactor = jax.tree.map(every, cofactor)
 
 
 class Linearised(eqx.Module):
-    """A term at given parameters: the m whitened residuals of each group, and their derivatives by the local parameters
-    of each block that it touches; zero where the group is not used."""
+    """A term at given parameters: the m whitened residuals of each group, and their
+    derivatives by the local parameters of each block that it touches; zero where the
+    group is not used."""
 
     residuals: Float[Array, "group m"]
     columns: tuple[Float[Array, "group m _"], ...]
 
 
 def closed(term: Term, families: Families) -> Term:
-    """The term with a condition that carries what it closes over, so that it can be differentiated by that, too."""
+    """The term with a condition that carries what it closes over, so that it can be
+    differentiated by that, too."""
     shape = lambda a: jax.ShapeDtypeStruct(jnp.shape(a)[1:], jnp.result_type(a))
     blocks = (jax.tree.map(shape, families[name]) for name, _ in term.touches)
-    condition = eqx.filter_closure_convert(term.condition, *blocks, jax.tree.map(shape, term.observations))
+    condition = eqx.filter_closure_convert(
+        term.condition, *blocks, jax.tree.map(shape, term.observations)
+    )
     return eqx.tree_at(lambda t: t.condition, term, condition)
 
 
@@ -87,7 +98,11 @@ def moved(family: Any, steps: Float[Array, "member d"]) -> Any:
 
 def standard(family: Any) -> Any:
     """All members of a family in their standard form."""
-    return jax.vmap(lambda block: block.normalised())(family) if isinstance(family, AbstractParameters) else family
+    return (
+        jax.vmap(lambda block: block.normalised())(family)
+        if isinstance(family, AbstractParameters)
+        else family
+    )
 
 
 def _moved(block: Any, step: Float[Array, " d"]) -> Any:
@@ -114,7 +129,8 @@ def linearised(term: Term, families: Families, steps: Steps) -> Linearised:
 
 
 def _parts(term: Term, families: Families, steps: Steps) -> tuple:
-    """What each group consists of: observation, cofactor, use, and its blocks with their displacements."""
+    """What each group consists of: observation, cofactor, use, and its blocks with
+    their displacements."""
     take = lambda tree, member: jax.tree.map(lambda a: a[member], tree)
     blocks = tuple(take(families[name], member) for name, member in term.touches)
     local = tuple(steps[name][member] for name, member in term.touches)
@@ -126,7 +142,9 @@ def _of_group(term: Term) -> Callable:
     condition = lambda blocks, observation: term.condition(*blocks, observation)
 
     def one(observation, cofactor, use, blocks, local):
-        displaced = tuple(_moved(block, step) for block, step in zip(blocks, local, strict=True))
+        displaced = tuple(
+            _moved(block, step) for block, step in zip(blocks, local, strict=True)
+        )
         g, d = discrepancy(condition, displaced, observation, cofactor, use)
         return jnp.stack(whitened(g, d, use))
 

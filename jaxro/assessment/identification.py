@@ -1,20 +1,22 @@
 """Identification: not only that an error is found, but in which point.
 
-An error that moves w_i by delta moves the w of the other points by rho_ij delta. Point i is *identified* by a test if
-it is the one point that is named (`rejection.undecided`): |w_i| exceeds the limit, no other |w| is larger, and no other
-point explains the misfit as well. With x = w_i and v_j normal, independent of x, w_j = rho x + sqrt(1 - rho²) v_j, so
-that for a positive error all of this is
+An error that moves w_i by delta moves the w of the other points by rho_ij delta. Point
+i is *identified* by a test if it is the one point that is named
+(`rejection.undecided`): |w_i| exceeds the limit, no other |w| is larger, and no other
+point explains the misfit as well. With x = w_i and v_j normal, independent of x, w_j =
+rho x + sqrt(1 - rho²) v_j, so that for a positive error all of this is
 
     x > limit,    x > sqrt((1 + rho) / (1 - rho)) v_j,    x > -sqrt((1 - rho) / (1 + rho)) v_j,
     x > (k + rho v_j) / sqrt(1 - rho²),
 
-k the normal value of `doubt`. With X the largest right-hand side, P(i is identified) is the mean of Φ(delta - X) over
-the v. The *minimal identifiable error* is that of which the mean is the wanted power, as the minimal detectable error
-(Baarda 1968) is that of which P(|w_i| > limit) is. With doubt = 1 it is the minimal identifiable bias of the largest
-|w| (Teunissen 2018; Rofatto et al. 2020). It is infinite where |rho| = 1.
+k the normal value of `doubt`. With X the largest right-hand side, P(i is identified) is
+the mean of Φ(delta - X) over the v. The *minimal identifiable error* is that of which
+the mean is the wanted power, as the minimal detectable error (Baarda 1968) is that of
+which P(|w_i| > limit) is. With doubt = 1 it is the minimal identifiable bias of the
+largest |w| (Teunissen 2018; Rofatto et al. 2020). It is infinite where |rho| = 1.
 
-All is of first order, at the measured coordinates, with a known sigma0. What depends on several residuals at once is
-simulated from a key, with the same draws for all points.
+All is of first order, at the measured coordinates, with a known sigma0. What depends on
+several residuals at once is simulated from a key, with the same draws for all points.
 """
 
 import equinox as eqx
@@ -24,13 +26,13 @@ from jax import lax
 from jax.scipy.special import ndtr
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from .. import critical_values as critical
-from ..conditions import linearised
-from ..correlations import Normalised, normalised
-from ..familywise import largest_w
-from ..orientation import Orientation
-from ..pairs import Coordinates, Pair, cleaned
-from ..rejection.undecided import DOUBT, explaining
+from ..adjustment import critical_values as critical
+from ..geometry.linear import linearised
+from ..geometry.pairs import Coordinates, Pair, cleaned
+from ..orientation.orient import Orientation
+from .correlations import Normalised, normalised
+from .familywise import largest_w
+from .undecided import DOUBT, explaining
 
 PerPoint = Float[Array, "point"]
 
@@ -42,13 +44,16 @@ SAME = 1e-6
 
 
 class Identification(eqx.Module):
-    """Which errors of a pair could be found, and which attributed to their point; zero or False where masked.
+    """Which errors of a pair could be found, and which attributed to their point; zero
+    or False where masked.
 
-    `tested`: points that others check. `partner`: the point with which a point is confused most easily, that of the
-    largest |rho|, and this `correlation`, with its sign. `limit`: of |w|. Sizes of errors in units of the standard
-    deviation of w: `found` with the power wanted in the point itself, and `identified` with it. `detectable` and
-    `identifiable`: the same errors of the coordinates (x_left, y_left, x_right, y_right) in their unit; infinite where
-    an error shows nowhere, or has no size at which it is attributed to its point.
+    `tested`: points that others check. `partner`: the point with which a point is
+    confused most easily, that of the largest |rho|, and this `correlation`, with its
+    sign. `limit`: of |w|. Sizes of errors in units of the standard deviation of w:
+    `found` with the power wanted in the point itself, and `identified` with it.
+    `detectable` and `identifiable`: the same errors of the coordinates (x_left, y_left,
+    x_right, y_right) in their unit; infinite where an error shows nowhere, or has no
+    size at which it is attributed to its point.
     """
 
     tested: Bool[Array, "point"]
@@ -62,9 +67,10 @@ class Identification(eqx.Module):
 
 
 class Chances(eqx.Module):
-    """Of an error in each point: how often it is attributed to its point (`correct`), to another one (`wrong`), to
-    several of which it is one (`undecided`) or not one (`misled`), or nothing is found (`missed`). They add up to 1;
-    zero where a point is not tested."""
+    """Of an error in each point: how often it is attributed to its point (`correct`),
+    to another one (`wrong`), to several of which it is one (`undecided`) or not one
+    (`misled`), or nothing is found (`missed`). They add up to 1; zero where a point is
+    not tested."""
 
     correct: PerPoint
     wrong: PerPoint
@@ -74,7 +80,8 @@ class Chances(eqx.Module):
 
 
 def correlations(pair: Pair, orientation: Orientation) -> Float[Array, "point point"]:
-    """Correlations of the w of all points of one pair; zero where a point is masked or not checked by others."""
+    """Correlations of the w of all points of one pair; zero where a point is masked or
+    not checked by others."""
     return _normalised(pair, orientation)[1].matrix()
 
 
@@ -90,12 +97,15 @@ def identify(
     doubt: float = DOUBT,
     draws: int = 4096,
 ) -> Identification:
-    """The minimal detectable beside the minimal identifiable errors of one pair at its orientation.
+    """The minimal detectable beside the minimal identifiable errors of one pair at its
+    orientation.
 
-    `sigma0`: the standard deviation of unit weight: 1 where pair.sigma are the standard deviations. `level` of the test
-    of each point, or (`familywise`) of all together. `doubt`: of the points that are named together, 1 if the largest
-    |w| alone decides. `draws` of all residuals: with 4,096 the power of the identifiable errors is right to 0.005; the
-    work is draws × points². Under jit and vmap the options but sigma0 and the key are static.
+    `sigma0`: the standard deviation of unit weight: 1 where pair.sigma are the standard
+    deviations. `level` of the test of each point, or (`familywise`) of all together.
+    `doubt`: of the points that are named together, 1 if the largest |w| alone decides.
+    `draws` of all residuals: with 4,096 the power of the identifiable errors is right
+    to 0.005; the work is draws × points². Under jit and vmap the options but sigma0 and
+    the key are static.
     """
     pair, known = _normalised(pair, orientation)
     limit = _limit(known, level, familywise)
@@ -111,12 +121,18 @@ def identify(
     linear = linearised(pair, orientation.pose)
 
     def of_coordinates(delta: PerPoint) -> Coordinates:
-        """delta sigma0 sigma / sqrt(r_k), r_k = r B_k² Q_k / D the redundancy number of the coordinate."""
+        """delta sigma0 sigma / sqrt(r_k), r_k = r B_k² Q_k / D the redundancy number of
+        the coordinate."""
 
         def one(b: PerPoint) -> PerPoint:
             part = b**2 * pair.sigma**2 * linear.weight * known.redundancy
             seen = known.tested & (part > SAME)
-            size = delta * jnp.asarray(sigma0) * pair.sigma / jnp.sqrt(jnp.where(seen, part, 1.0))
+            size = (
+                delta
+                * jnp.asarray(sigma0)
+                * pair.sigma
+                / jnp.sqrt(jnp.where(seen, part, 1.0))
+            )
             return jnp.where(pair.mask, jnp.where(seen, size, jnp.inf), 0.0)
 
         return tuple(one(b) for b in linear.gradient)
@@ -127,7 +143,9 @@ def identify(
         correlation=correlation,
         limit=limit,
         found=found,
-        identified=jnp.where(known.tested, identified, jnp.where(pair.mask, jnp.inf, 0.0)),
+        identified=jnp.where(
+            known.tested, identified, jnp.where(pair.mask, jnp.inf, 0.0)
+        ),
         detectable=of_coordinates(jnp.full_like(known.w, 1.0) * found),
         identifiable=of_coordinates(jnp.where(known.tested, identified, 1.0)),
     )
@@ -146,15 +164,18 @@ def chances(
     doubt: float = DOUBT,
     draws: int = 4096,
 ) -> Chances:
-    """What becomes of an error of given size in one point, for every point in turn, by simulation of the w.
+    """What becomes of an error of given size in one point, for every point in turn, by
+    simulation of the w.
 
-    `size`: in the unit of the coordinates, one or one per point, of the `coordinate` (0 to 3: x_left, y_left, x_right,
-    y_right). Other arguments as of `identify`.
+    `size`: in the unit of the coordinates, one or one per point, of the `coordinate` (0
+    to 3: x_left, y_left, x_right, y_right). Other arguments as of `identify`.
     """
     pair, known = _normalised(pair, orientation)
     linear = linearised(pair, orientation.pose)
     limit = _limit(known, level, familywise)
-    jump = linear.gradient[coordinate] * jnp.broadcast_to(jnp.asarray(size, float), known.w.shape)
+    jump = linear.gradient[coordinate] * jnp.broadcast_to(
+        jnp.asarray(size, float), known.w.shape
+    )
     delta = jump * jnp.sqrt(linear.weight * known.redundancy) / jnp.asarray(sigma0)
     errors = _errors(known, key, draws)
 
@@ -168,34 +189,57 @@ def chances(
             named = explaining(known._replace(w=w), largest, doubt)
             found = jnp.max(jnp.abs(w)) > limit
             alone, among = jnp.sum(named) == 1, jnp.any(named & own)
-            right, several, other = found & alone & among, found & ~alone & among, found & ~among
+            right, several, other = (
+                found & alone & among,
+                found & ~alone & among,
+                found & ~among,
+            )
             return right, other & alone, several, other & ~alone, ~found
 
         tested = jnp.any(own & known.tested)
-        share = lambda happened: jnp.where(tested, jnp.mean(happened.astype(float)), 0.0)
+        share = lambda happened: jnp.where(
+            tested, jnp.mean(happened.astype(float)), 0.0
+        )
         return jax.tree.map(share, jax.vmap(outcome)(errors))
 
-    correct, wrong, undecided, misled, missed = lax.map(one, jnp.arange(known.w.shape[0]))
-    return Chances(correct=correct, wrong=wrong, undecided=undecided, misled=misled, missed=missed)
+    correct, wrong, undecided, misled, missed = lax.map(
+        one, jnp.arange(known.w.shape[0])
+    )
+    return Chances(
+        correct=correct, wrong=wrong, undecided=undecided, misled=misled, missed=missed
+    )
 
 
 def _normalised(pair: Pair, orientation: Orientation) -> tuple[Pair, Normalised]:
     if pair.x_left.ndim != 1:
-        raise ValueError(f"one pair is wanted, but the coordinates have shape {pair.x_left.shape}: use jax.vmap")
+        raise ValueError(
+            f"one pair is wanted, but the coordinates have shape {pair.x_left.shape}: "
+            "use jax.vmap"
+        )
     pair, _ = cleaned(pair)
-    return pair, normalised(linearised(pair, orientation.pose), pair.mask & orientation.usable)
+    return pair, normalised(
+        linearised(pair, orientation.pose), pair.mask & orientation.usable
+    )
 
 
 def _limit(known: Normalised, level: float, familywise: bool) -> Float[Array, ""]:
-    return largest_w(level, known) if familywise else critical.normal(level) + 0 * known.squares
+    return (
+        largest_w(level, known)
+        if familywise
+        else critical.normal(level) + 0 * known.squares
+    )
 
 
-def _errors(known: Normalised, key: PRNGKeyArray, draws: int) -> Float[Array, "draw point"]:
+def _errors(
+    known: Normalised, key: PRNGKeyArray, draws: int
+) -> Float[Array, "draw point"]:
     """The w of errorless pairs."""
     root = jnp.sqrt(jnp.where(known.tested, known.redundancy, 1.0))
     noise = jax.random.normal(key, (draws, known.w.shape[0]), float)
     along = noise @ (known.basis * root[:, None])
-    return jnp.where(known.tested[None, :], noise / root[None, :] - along @ known.basis.T, 0.0)
+    return jnp.where(
+        known.tested[None, :], noise / root[None, :] - along @ known.basis.T, 0.0
+    )
 
 
 def _partners(known: Normalised) -> tuple[PerPoint, Int[Array, "point"]]:
@@ -210,9 +254,14 @@ def _partners(known: Normalised) -> tuple[PerPoint, Int[Array, "point"]]:
 
 
 def _least(
-    known: Normalised, errors: Float[Array, "draw point"], point: Int[Array, ""], limit: Array, doubt: float
+    known: Normalised,
+    errors: Float[Array, "draw point"],
+    point: Int[Array, ""],
+    limit: Array,
+    doubt: float,
 ) -> tuple[Float[Array, "draw"], Bool[Array, ""]]:
-    """X of every draw, and whether any size of error can be told from one in another point."""
+    """X of every draw, and whether any size of error can be told from one in another
+    point."""
     own = jnp.arange(known.w.shape[0]) == point
     others = known.tested & ~own
     rho = jnp.where(others, known.row(point), 0.0)
@@ -222,13 +271,18 @@ def _least(
     larger = jnp.sqrt((1 + rho) / jnp.maximum(1 - rho, SAME))
     smaller = jnp.sqrt((1 - rho) / jnp.maximum(1 + rho, SAME))
     in_doubt = (critical.normal(doubt) + rho[None, :] * v) / across[None, :]
-    needed = jnp.maximum(jnp.maximum(larger[None, :] * v, -smaller[None, :] * v), in_doubt)
+    needed = jnp.maximum(
+        jnp.maximum(larger[None, :] * v, -smaller[None, :] * v), in_doubt
+    )
     needed = jnp.max(jnp.where(others[None, :], needed, -jnp.inf), axis=1)
     return jnp.maximum(needed, limit), jnp.all(jnp.abs(rho) < 1 - SAME)
 
 
-def _size(least: Float[Array, "draw"], power: Array, able: Bool[Array, ""]) -> Float[Array, ""]:
-    """delta with mean Φ(delta - X) = power, by bisection; infinite where it is not able."""
+def _size(
+    least: Float[Array, "draw"], power: Array, able: Bool[Array, ""]
+) -> Float[Array, ""]:
+    """delta with mean Φ(delta - X) = power, by bisection; infinite where it is not
+    able."""
 
     def halved(_, interval):
         low, high = interval

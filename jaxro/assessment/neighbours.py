@@ -1,22 +1,28 @@
-"""Whether the residuals of neighbouring points agree: a test of the independence that standard deviations assume.
+"""Whether the residuals of neighbouring points agree: a test of the independence that
+standard deviations assume.
 
-The errors of a coordinate at two points of a photo, d apart, may have the correlation rho exp(-(d/l)²), rho at
-neighbours. Then the whitened residuals r = B e / |B| (B = dg/dl of the coplanarity condition) have the covariance
+The errors of a coordinate at two points of a photo, d apart, may have the correlation
+rho exp(-(d/l)²), rho at neighbours. Then the whitened residuals r = B e / |B| (B =
+dg/dl of the coplanarity condition) have the covariance
 
-    1 + rho K,    K_ij = u_i(left) . u_j(left) exp(-(d_left/l)²) + u_i(right) . u_j(right) exp(-(d_right/l)²),
+    1 + rho K,
+    K_ij = u_i(left) . u_j(left) exp(-(d_left/l)²) + u_i(right) . u_j(right) exp(-(d_right/l)²),
 
-u = B / |B|, K_ii = 0. The locally best test of rho = 0 is the score (King and Hillier 1985; of Moran's 1950 form)
+u = B / |B|, K_ii = 0. The locally best test of rho = 0 is the score (King and Hillier
+1985; of Moran's 1950 form)
 
     T = r' K r / r' r - tr(R K) / (n - 5),    R = 1 - H,
 
-with R the projection by the adjustment, which makes residuals correlated even where the errors are not. T does not
-depend on sigma. Its first three moments are exact: with A = R (K - tr(R K) / (n - 5)) R and f = n - 5
+with R the projection by the adjustment, which makes residuals correlated even where the
+errors are not. T does not depend on sigma. Its first three moments are exact: with A =
+R (K - tr(R K) / (n - 5)) R and f = n - 5
 
     E T = 0,    E T² = 2 tr A² / (f (f + 2)),    E T³ = 8 tr A³ / (f (f + 2) (f + 4)),
 
-and its distribution is taken as Pearson's type III with these (Henshaw 1966). As l is not known, K is the sum over
-four lengths. Of many pairs f T, its variance and its third moment are added
-up. Agreement along the epipolar lines shows in no residual, nor in this test.
+and its distribution is taken as Pearson's type III with these (Henshaw 1966). As l is
+not known, K is the sum over four lengths. Of many pairs f T, its variance and its third
+moment are added up. Agreement along the epipolar lines shows in no residual, nor in
+this test.
 """
 
 from collections.abc import Callable
@@ -30,12 +36,13 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
-from ..conditions import Linear, linearised
-from ..orientation import Orientation
-from ..pairs import Pair, cleaned
+from ..geometry.linear import Linear, linearised
+from ..geometry.pairs import Pair, cleaned
+from ..orientation.orient import Orientation
 
 LENGTHS = (0.025, 0.05, 0.1, 0.2)
-"""Correlation lengths l that are tried, in units of the side of a square as large as the area of the points."""
+"""Correlation lengths l that are tried, in units of the side of a square as large as
+the area of the points."""
 
 LEVEL = 0.05
 """Probability below which a pattern is reported."""
@@ -44,12 +51,15 @@ Values = Float[Array | np.ndarray, "*pairs"]
 
 
 class Pattern(eqx.Module):
-    """The test of one pair, or of many together; for a batch every field has leading axes.
+    """The test of one pair, or of many together; for a batch every field has leading
+    axes.
 
-    `probability` that independent errors show as much agreement or more. `rho`: the estimated correlation of
-    neighbouring errors, in 0 to 1, at the likeliest of the tried lengths; `length`: that length l, in the unit of the
-    photo coordinates. `score`, its `variance` and its `third` moment without correlation: what `pooled` adds up. With
-    fewer than two degrees of freedom, and where no points are near each other, the probability is 1.
+    `probability` that independent errors show as much agreement or more. `rho`: the
+    estimated correlation of neighbouring errors, in 0 to 1, at the likeliest of the
+    tried lengths; `length`: that length l, in the unit of the photo coordinates.
+    `score`, its `variance` and its `third` moment without correlation: what `pooled`
+    adds up. With fewer than two degrees of freedom, and where no points are near each
+    other, the probability is 1.
     """
 
     probability: Values
@@ -62,7 +72,8 @@ class Pattern(eqx.Module):
 
     @property
     def flagged(self) -> Any:
-        """Whether independent errors would show such a pattern in less than 5 % of all cases."""
+        """Whether independent errors would show such a pattern in less than 5 % of all
+        cases."""
         return self.probability < LEVEL
 
 
@@ -101,7 +112,11 @@ def of_linear(linear: Linear, coordinates: tuple[Any, ...]) -> Pattern:
         inner = projected(kernel)
         trace = xp.trace(inner)
         projection = xp.diag(xp.where(use, 1.0, 0.0)) - q.T @ q
-        return trace, inner - trace / free * projection, xp.sum(share * (kernel @ share)) - trace / free
+        return (
+            trace,
+            inner - trace / free * projection,
+            xp.sum(share * (kernel @ share)) - trace / free,
+        )
 
     unit = _extent(coordinates[:2], use, xp)
     kernel_of = agreement(linear, coordinates)
@@ -118,7 +133,11 @@ def of_linear(linear: Linear, coordinates: tuple[Any, ...]) -> Pattern:
         full = size + trace**2 / free
         mean = t + trace / free
         slope = full - mean * trace
-        rho = xp.where(known & (slope > 0), (mean * free - trace) / xp.where(slope > 0, slope, 1.0), 0.0)
+        rho = xp.where(
+            known & (slope > 0),
+            (mean * free - trace) / xp.where(slope > 0, slope, 1.0),
+            0.0,
+        )
         candidates.append((standardised, xp.clip(rho, 0.0, 1.0), length * unit, size))
     _, inner, t = moments(total)
     square = inner @ inner
@@ -127,7 +146,9 @@ def of_linear(linear: Linear, coordinates: tuple[Any, ...]) -> Pattern:
     score = xp.where(known, t * free, 0.0)
     variance = xp.where(known, 2 * second * free / (free + 2), 0.0)
     skew = xp.where(known, 8 * third * free**2 / ((free + 2) * (free + 4)), 0.0)
-    best, rhos, lengths, sizes = (xp.stack(values) for values in zip(*candidates, strict=True))
+    best, rhos, lengths, sizes = (
+        xp.stack(values) for values in zip(*candidates, strict=True)
+    )
     chosen = xp.argmax(best)
     return Pattern(
         probability=_tail(score, variance, skew, xp),
@@ -154,16 +175,22 @@ def agreement(linear: Linear, coordinates: tuple[Any, ...]) -> Callable:
         distance = sum((c[:, None] - c[None, :]) ** 2 for c in coordinates[part])
         photos.append((xp.where(both, cosines, 0.0), distance))
 
-    return lambda length: sum(cosines * xp.exp(-distance / length**2) for cosines, distance in photos)
+    return lambda length: sum(
+        cosines * xp.exp(-distance / length**2) for cosines, distance in photos
+    )
 
 
 def pooled(patterns: Pattern) -> Pattern:
-    """The test of many pairs together, (pair,): their scores, variances and third moments added up.
+    """The test of many pairs together, (pair,): their scores, variances and third
+    moments added up.
 
     `rho` and `length` are the means of the pairs, weighted by what each tells of rho.
     """
     xp: Any = np if isinstance(patterns.score, np.ndarray) else jnp
-    score, variance, third = (xp.asarray(xp.sum(x)) for x in (patterns.score, patterns.variance, patterns.third))
+    score, variance, third = (
+        xp.asarray(xp.sum(x))
+        for x in (patterns.score, patterns.variance, patterns.third)
+    )
     weight = patterns.information
     whole = xp.asarray(xp.sum(weight))
     share = weight / xp.where(whole > 0, whole, 1.0)
@@ -179,7 +206,8 @@ def pooled(patterns: Pattern) -> Pattern:
 
 
 def _tail(score, variance, third, xp):
-    """The probability of a larger score by Pearson's type III (in the normal form of Wilson and Hilferty 1931)."""
+    """The probability of a larger score by Pearson's type III (in the normal form of
+    Wilson and Hilferty 1931)."""
     known = variance > 0
     deviation = xp.sqrt(xp.where(known, variance, 1.0))
     z, skew = score / deviation, third / deviation**3
@@ -211,8 +239,12 @@ def _orthonormal(columns: list, xp) -> list:
 
 
 def _extent(place, use, xp):
-    """The side of a square as large as the rectangle that holds the points; at least a tenth of its longer side."""
-    sides = [xp.max(xp.where(use, c, -xp.inf)) - xp.min(xp.where(use, c, xp.inf)) for c in place]
+    """The side of a square as large as the rectangle that holds the points; at least a
+    tenth of its longer side."""
+    sides = [
+        xp.max(xp.where(use, c, -xp.inf)) - xp.min(xp.where(use, c, xp.inf))
+        for c in place
+    ]
     longer = xp.maximum(*sides)
     side = xp.maximum(xp.sqrt(xp.maximum(sides[0] * sides[1], 0.0)), 0.1 * longer)
     return xp.where(xp.isfinite(side) & (side > 0), side, 1.0)

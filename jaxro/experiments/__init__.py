@@ -1,7 +1,7 @@
 """The papers' tables calculated again, and procedures compared by simulation.
 
-Each experiment is a function that returns numbers, and one in a module beside it that makes tables of them. Those of
-papers are in REPRODUCTIONS.
+Each experiment is a function that returns numbers, and one in a module beside it that
+makes tables of them. Those of papers are in REPRODUCTIONS.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,8 @@ from . import (
 
 
 class Reproduction(NamedTuple):
-    """An experiment of a paper: run(), or run(trials, seed, progress) where it is `random`, and tables(results)."""
+    """An experiment of a paper: run(), or run(trials, seed, progress) where it is
+    `random`, and tables(results)."""
 
     run: Callable
     tables: Callable
@@ -27,9 +28,14 @@ class Reproduction(NamedTuple):
 
 
 REPRODUCTIONS: dict[str, Reproduction] = {
-    "dorozhinsky1971": Reproduction(dorozhinsky1971.run, dorozhinsky1971_tables.tables, False),
+    "dorozhinsky1971": Reproduction(
+        dorozhinsky1971.run, dorozhinsky1971_tables.tables, False
+    ),
     "burshtynskaya1989": Reproduction(
-        burshtynskaya1989.run, burshtynskaya1989_tables.tables, True, burshtynskaya1989.VARIANTS
+        burshtynskaya1989.run,
+        burshtynskaya1989_tables.tables,
+        True,
+        burshtynskaya1989.VARIANTS,
     ),
     "gutkin1982": Reproduction(gutkin1982.run, gutkin1982_tables.tables, False),
 }

@@ -1,15 +1,20 @@
-"""Table 2 of Burshtynskaya and Tumskaya (1989): errors found by residual parallaxes, and by Grubbs' test besides.
+"""Table 2 of Burshtynskaya and Tumskaya (1989): errors found by residual parallaxes,
+and by Grubbs' test besides.
 
-Sixteen points in eight rows, flat mock pairs, f = b = y = 70 mm, sigma = 0.01 mm; errors of the right-hand y at random
-points, of random sign. The paper measured 34 pairs, without noise. Its table 1, which listed the errors, is mostly
-lost; taken here: 10, 14 and 10 pairs of its three classes, 26 with one error, 6 with two and 2 with three: its 44.
+Sixteen points in eight rows, flat mock pairs, f = b = y = 70 mm, sigma = 0.01 mm;
+errors of the right-hand y at random points, of random sign. The paper measured 34
+pairs, without noise. Its table 1, which listed the errors, is mostly lost; taken here:
+10, 14 and 10 pairs of its three classes, 26 with one error, 6 with two and 2 with
+three: its 44.
 
-The legible part of table 1 contradicts the classes of the text: pairs I-4 and I-5 have errors of 0.02 mm (2 sigma, not
-1), III-1 has 0.2 mm (20 sigma, not 8 to 10). The classes here are those of the text.
+The legible part of table 1 contradicts the classes of the text: pairs I-4 and I-5 have
+errors of 0.02 mm (2 sigma, not 1), III-1 has 0.2 mm (20 sigma, not 8 to 10). The
+classes here are those of the text.
 
-The paper does not give its tolerances either. The first stage is the algorithm of 1971 with eps4 = 0.01 mm as there,
-and with 0.045 mm. The figure of the layout is lost, too. With rows at 1, .9, .6, .1 every eps4 from .0405 to .0464 mm
-rejects just the points that the text describes for all three pairs; with rows at 1, .85, .7, .1 no eps4 does.
+The paper does not give its tolerances either. The first stage is the algorithm of 1971
+with eps4 = 0.01 mm as there, and with 0.045 mm. The figure of the layout is lost, too.
+With rows at 1, .9, .6, .1 every eps4 from .0405 to .0464 mm rejects just the points
+that the text describes for all three pairs; with rows at 1, .85, .7, .1 no eps4 does.
 """
 
 from collections.abc import Callable, Iterable
@@ -21,12 +26,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import simulation
-from ..batch import clean_batch
-from ..pairs import Pair
-from ..programs import QUICK, Program
+from ..batches.batch import clean_batch
+from ..geometry import mock_pairs
+from ..geometry.mock_pairs import noisy, planted
+from ..geometry.pairs import Pair
 from ..rejection import AbstractProcedure, Rejection, TwoStage
-from ..simulation import noisy, planted
+from ..xla.programs import QUICK, Program
 from . import burshtynskaya1989_conclusions as conclusions
 from .burshtynskaya1989_conclusions import Conclusions
 
@@ -36,8 +41,10 @@ VARIANTS = 34
 TOLERANCES = (0.01, 0.045)
 """eps4 of the first stage, mm; the last is the one that fits."""
 LAYOUTS = {
-    "1, .9, .6, .1": simulation.row_layout(),
-    "1, .85, .7, .1": simulation.row_layout((1.0, 0.85, 0.7, 0.1, -0.1, -0.7, -0.85, -1.0)),
+    "1, .9, .6, .1": mock_pairs.row_layout(),
+    "1, .85, .7, .1": mock_pairs.row_layout(
+        (1.0, 0.85, 0.7, 0.1, -0.1, -0.7, -0.85, -1.0)
+    ),
 }
 """Of the sixteen points; the first is used, the second cannot be the paper's."""
 NOTHING = 1e3
@@ -45,7 +52,8 @@ NOTHING = 1e3
 
 
 class ErrorClass(NamedTuple):
-    """Least and largest error (sigma), and the numbers of pairs with one, two and three of them."""
+    """Least and largest error (sigma), and the numbers of pairs with one, two and three
+    of them."""
 
     least: float
     most: float
@@ -60,7 +68,8 @@ CLASSES = {
 
 
 class Variant(NamedTuple):
-    """A pair of the paper that its text describes: errors (mm) by point, and the points rejected by their parallax."""
+    """A pair of the paper that its text describes: errors (mm) by point, and the points
+    rejected by their parallax."""
 
     errors: dict[int, float]
     rejected: tuple[int, ...]
@@ -77,9 +86,10 @@ NAMED = {
 class Counts:
     """The rows of table 2: points and errors, and beside them the pairs.
 
-    `by_parallax`, `by_grubbs`: wrong points rejected by the first and the second stage; `good`: good points rejected.
-    Pairs left with exactly their good points: `pairs_by_parallax` after the first stage, `pairs_by_grubbs` by the
-    second; `pairs_good`: that lost a good point.
+    `by_parallax`, `by_grubbs`: wrong points rejected by the first and the second stage;
+    `good`: good points rejected. Pairs left with exactly their good points:
+    `pairs_by_parallax` after the first stage, `pairs_by_grubbs` by the second;
+    `pairs_good`: that lost a good point.
     """
 
     points: int
@@ -109,11 +119,13 @@ class Run:
 
 @dataclass(frozen=True)
 class Results:
-    """All runs; and of the pairs that the text describes, by layout (first key) and name:
+    """All runs; and of the pairs that the text describes, by layout (first key) and
+    name:
 
-    `named`: by tolerance the points rejected by parallax and by Grubbs, on the first layout; `fitting`: (above, up to),
-    the tolerances eps4 (mm) with which the first stage rejects just the points that the text names. `conclusions`: the
-    paper's six, with the last tolerance.
+    `named`: by tolerance the points rejected by parallax and by Grubbs, on the first
+    layout; `fitting`: (above, up to), the tolerances eps4 (mm) with which the first
+    stage rejects just the points that the text names. `conclusions`: the paper's six,
+    with the last tolerance.
     """
 
     runs: list[Run]
@@ -122,8 +134,13 @@ class Results:
     conclusions: Conclusions
 
 
-def run(variants: int = VARIANTS, seed: int = 0, progress: Callable[[int, int], None] | None = None) -> Results:
-    """So many variants (the paper's 34, again and again) without and with noise, through both stages.
+def run(
+    variants: int = VARIANTS,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Results:
+    """So many variants (the paper's 34, again and again) without and with noise,
+    through both stages.
 
     All pairs go as one batch, so that each stage is compiled once.
     """
@@ -131,7 +148,9 @@ def run(variants: int = VARIANTS, seed: int = 0, progress: Callable[[int, int], 
     limits = np.array([CLASSES[name][:2] for name in classes])
     key, planned = jax.random.key(seed), conclusions.plan()
     drawn = jax.random.split(key, variants), jnp.asarray(errors), jnp.asarray(limits)
-    pairs, wrong = Program(_simulated, {}, QUICK)((drawn, jnp.asarray(planned.errors), jax.random.fold_in(key, 1989)))
+    pairs, wrong = Program(_simulated, {}, QUICK)(
+        (drawn, jnp.asarray(planned.errors), jax.random.fold_in(key, 1989))
+    )
     wrong = np.asarray(wrong)
     described = slice(2 * variants, 2 * variants + len(NAMED) * len(LAYOUTS))
     rest = slice(described.stop, None)
@@ -145,14 +164,22 @@ def run(variants: int = VARIANTS, seed: int = 0, progress: Callable[[int, int], 
             )
             by_class = {name: count(classes == name) for name in CLASSES}
             runs.append(Run(eps4, noise, count(slice(None)), by_class))
-        numbers = [[_numbers(row) for row in stage[described][: len(NAMED)]] for stage in (first, second)]
+        numbers = [
+            [_numbers(row) for row in stage[described][: len(NAMED)]]
+            for stage in (first, second)
+        ]
         named[eps4] = dict(zip(NAMED, zip(*numbers, strict=True), strict=True))
-        concluded = conclusions.conclude(planned, first[rest], second[rest])  # the last tolerance stays
+        concluded = conclusions.conclude(
+            planned, first[rest], second[rest]
+        )  # the last tolerance stays
         if progress is not None:
             progress(done + 1, len(TOLERANCES) + 1)
     excess = excesses(pairs)[described].reshape(len(LAYOUTS), len(NAMED), -1)
     fitting = {
-        layout: {name: _fitting(row, NAMED[name].rejected) for name, row in zip(NAMED, rows, strict=True)}
+        layout: {
+            name: _fitting(row, NAMED[name].rejected)
+            for name, row in zip(NAMED, rows, strict=True)
+        }
         for layout, rows in zip(LAYOUTS, excess, strict=True)
     }
     if progress is not None:
@@ -161,19 +188,22 @@ def run(variants: int = VARIANTS, seed: int = 0, progress: Callable[[int, int], 
 
 
 def rejected(pairs: Pair, eps4: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points rejected by the first and by the second stage of `TwoStage`, (pair, point)."""
+    """Points rejected by the first and by the second stage of `TwoStage`, (pair,
+    point)."""
     kept, _ = clean_batch(pairs, _first(eps4), select=_decision)
     left = clean_batch(pairs.with_mask(kept), TwoStage().second, select=_mask)
     return ~np.asarray(kept), np.asarray(kept & ~left)
 
 
 def excesses(pairs: Pair) -> np.ndarray:
-    """|q| - mean |q| in the final check of the first stage, (pair, point), where the stage rejected nothing before."""
+    """|q| - mean |q| in the final check of the first stage, (pair, point), where the
+    stage rejected nothing before."""
     return np.asarray(clean_batch(pairs, _first(NOTHING), select=_decision)[1])
 
 
 def common(intervals: Iterable[tuple[float, float]]) -> tuple[float, float]:
-    """What intervals (above, up to) have in common; nothing where the first number is not below the second."""
+    """What intervals (above, up to) have in common; nothing where the first number is
+    not below the second."""
     above, up_to = zip(*intervals, strict=True)
     return max(above), min(up_to)
 
@@ -194,39 +224,63 @@ def _numbers(mask: np.ndarray) -> list[int]:
 
 
 def counts(wrong: np.ndarray, first: np.ndarray, second: np.ndarray) -> Counts:
-    """The rows of table 2 from what was planted and what each stage rejected, all (pair, point)."""
+    """The rows of table 2 from what was planted and what each stage rejected, all
+    (pair, point)."""
     out = first | second
     perfect, at_once = np.all(out == wrong, axis=1), np.all(first == wrong, axis=1)
     return Counts(
         wrong.size,
-        *(int(np.sum(each)) for each in (wrong, first & wrong, second & wrong, out & ~wrong, wrong & ~out)),
+        *(
+            int(np.sum(each))
+            for each in (
+                wrong,
+                first & wrong,
+                second & wrong,
+                out & ~wrong,
+                wrong & ~out,
+            )
+        ),
         len(wrong),
-        *(int(np.sum(each)) for each in (at_once, perfect & ~at_once, np.any(out & ~wrong, axis=1))),
+        *(
+            int(np.sum(each))
+            for each in (at_once, perfect & ~at_once, np.any(out & ~wrong, axis=1))
+        ),
     )
 
 
 def _pattern() -> tuple[np.ndarray, np.ndarray]:
     """The class and the number of errors of each of the 34 variants."""
-    rows = [(name, i) for name, c in CLASSES.items() for i, pairs in enumerate(c.pairs, 1) for _ in range(pairs)]
+    rows = [
+        (name, i)
+        for name, c in CLASSES.items()
+        for i, pairs in enumerate(c.pairs, 1)
+        for _ in range(pairs)
+    ]
     names, errors = zip(*rows, strict=True)
     return np.array(names), np.array(errors)
 
 
 def _simulated(plan: tuple):
-    """Pairs without noise, with noise, the described ones, those of the conclusions; wrong points of the first."""
+    """Pairs without noise, with noise, the described ones, those of the conclusions;
+    wrong points of the first."""
     drawn, errors, key = plan
-    exact = simulation.mock_pair(simulation.row_layout())
+    exact = mock_pairs.mock_pair(mock_pairs.row_layout())
 
     def one(key, errors, limits):
         noise, place, size, sign = jax.random.split(key, 4)
-        wrong = jnp.argsort(jnp.argsort(jax.random.uniform(place, exact.mask.shape, float))) < errors
-        sizes = jax.random.uniform(size, wrong.shape, float, limits[0], limits[1]) * SIGMA
+        wrong = (
+            jnp.argsort(jnp.argsort(jax.random.uniform(place, exact.mask.shape, float)))
+            < errors
+        )
+        sizes = (
+            jax.random.uniform(size, wrong.shape, float, limits[0], limits[1]) * SIGMA
+        )
         signed = jnp.where(jax.random.bernoulli(sign, shape=wrong.shape), sizes, -sizes)
         silent = planted(exact, y_right=jnp.where(wrong, signed, 0.0))
         return silent, noisy(silent, noise, SIGMA), wrong
 
     silent, measured, wrong = jax.vmap(one)(*drawn)
-    described = [_named(simulation.mock_pair(layout)) for layout in LAYOUTS.values()]
+    described = [_named(mock_pairs.mock_pair(layout)) for layout in LAYOUTS.values()]
     parts = silent, measured, *described, conclusions.measured(exact, errors, key)
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *parts), wrong
 

@@ -1,11 +1,14 @@
-"""What every procedure finds, and what it costs in good points, by simulation on a layout.
+"""What every procedure finds, and what it costs in good points, by simulation on a
+layout.
 
-A setting is a layout, a number of wrong points and the size of their errors. Each of its trials has normal errors in
-all four coordinates and, at random points, errors of that size (in sigma, of random sign) in the right-hand y. All
-procedures see the same trials.
+A setting is a layout, a number of wrong points and the size of their errors. Each of
+its trials has normal errors in all four coordinates and, at random points, errors of
+that size (in sigma, of random sign) in the right-hand y. All procedures see the same
+trials.
 
-A procedure that rejects more finds more, so they are also compared where all reject as often without cause: each whose
-level or tolerance can be set is set so that it spoils a given share of pairs without errors.
+A procedure that rejects more finds more, so they are also compared where all reject as
+often without cause: each whose level or tolerance can be set is set so that it spoils a
+given share of pairs without errors.
 """
 
 import math
@@ -18,14 +21,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..batch import clean_batch
-from ..elements import RelativePose
-from ..orientation import orient
-from ..pairs import Pair
-from ..programs import QUICK, Program
+from ..batches.batch import clean_batch
+from ..geometry.elements import RelativePose
+from ..geometry.mock_pairs import noisy, planted
+from ..geometry.pairs import Pair
+from ..orientation.orient import orient
+from ..orientation.results import is_usable
 from ..rejection import OUTCOMES, AbstractProcedure, Rejection
-from ..results import is_usable
-from ..simulation import noisy, planted
+from ..xla.programs import QUICK, Program
 from .calibration import Calibration, adjustable, calibrated
 
 LEAST = 6
@@ -33,7 +36,8 @@ LEAST = 6
 
 
 class Setting(NamedTuple):
-    """A layout by its name, a number of wrong points and the size of their errors (sigma; 0 where there are none)."""
+    """A layout by its name, a number of wrong points and the size of their errors
+    (sigma; 0 where there are none)."""
 
     layout: str
     errors: int
@@ -41,7 +45,8 @@ class Setting(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A mean over the trials and its standard error; NaN where there is nothing to average, or nothing to compare."""
+    """A mean over the trials and its standard error; NaN where there is nothing to
+    average, or nothing to compare."""
 
     value: float
     error: float
@@ -51,11 +56,13 @@ class Estimate(NamedTuple):
 class Score:
     """What one procedure did in one setting; shares are of 1.
 
-    `found`: wrong points named, the probability that a wrong point is rejected. `misnamed`: pairs in which the first
-    rejection takes a good point. `lost`: good points rejected. `perfect`: pairs named exactly, that is, left with all
-    of their good points and no other. `alarms`: pairs that lost a good point; without errors, the false alarms.
-    `unfinished`: pairs with another outcome than finished. `angle`: root mean square of the angle to the truth (arc
-    minutes), of the rotation or the base, whichever is larger, over the pairs with a usable orientation. `calibrated`:
+    `found`: wrong points named, the probability that a wrong point is rejected.
+    `misnamed`: pairs in which the first rejection takes a good point. `lost`: good
+    points rejected. `perfect`: pairs named exactly, that is, left with all of their
+    good points and no other. `alarms`: pairs that lost a good point; without errors,
+    the false alarms. `unfinished`: pairs with another outcome than finished. `angle`:
+    root mean square of the angle to the truth (arc minutes), of the rotation or the
+    base, whichever is larger, over the pairs with a usable orientation. `calibrated`:
     at the common share of false alarms.
     """
 
@@ -74,7 +81,8 @@ class Score:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All scores, and how each procedure was set for the comparison at the share `false_alarms`, by layout."""
+    """All scores, and how each procedure was set for the comparison at the share
+    `false_alarms`, by layout."""
 
     scores: list[Score]
     false_alarms: float
@@ -94,14 +102,20 @@ def compare(
 ) -> Comparison:
     """Every procedure in every setting that leaves a layout `LEAST` good points.
 
-    `layouts`: errorless pairs by name; their sigma is that of the simulated coordinates, known to the procedures.
-    `false_alarms`: share of pairs without errors that the calibrated procedures spoil; 0 leaves that comparison out.
-    `progress(done, total)` counts runs of a procedure.
+    `layouts`: errorless pairs by name; their sigma is that of the simulated
+    coordinates, known to the procedures. `false_alarms`: share of pairs without errors
+    that the calibrated procedures spoil; 0 leaves that comparison out. `progress(done,
+    total)` counts runs of a procedure.
     """
-    settable = [name for name, procedure in procedures.items() if false_alarms and adjustable(procedure)]
+    settable = [
+        name
+        for name, procedure in procedures.items()
+        if false_alarms and adjustable(procedure)
+    ]
     kinds = [(n, s) for n in errors for s in (sizes if n else (0.0,))]
     possible = {
-        name: [kind for kind in kinds if kind[0] <= int(exact.count) - LEAST] for name, exact in layouts.items()
+        name: [kind for kind in kinds if kind[0] <= int(exact.count) - LEAST]
+        for name, exact in layouts.items()
     }
     runs = sum(map(len, possible.values()))
     total = len(layouts) * len(settable) + runs * (len(procedures) + len(settable))
@@ -118,27 +132,49 @@ def compare(
         truth = orient(exact).pose
         known = calibrations.setdefault(layout, {})
         if false_alarms:
-            clean, _ = simulated(exact, Setting(layout, 0, 0.0), trials, seed, "calibration")
+            clean, _ = simulated(
+                exact, Setting(layout, 0, 0.0), trials, seed, "calibration"
+            )
             for name, procedure in procedures.items():
                 known[name] = calibrated(procedure, clean, false_alarms)
                 step(name in settable)
-        tuned = {name: c.procedure for name, c in known.items() if c.procedure is not None}
+        tuned = {
+            name: c.procedure for name, c in known.items() if c.procedure is not None
+        }
         for kind in possible[layout]:
             setting = Setting(layout, *kind)
             pairs, wrong = simulated(exact, setting, trials, seed)
             for name in procedures:
-                for procedure, own in ((procedures[name], False), (tuned.get(name), True)):
+                for procedure, own in (
+                    (procedures[name], False),
+                    (tuned.get(name), True),
+                ):
                     if procedure is not None:
-                        scores.append(Score(setting, name, own, trials, *_judged(procedure, pairs, wrong, truth)))
+                        scores.append(
+                            Score(
+                                setting,
+                                name,
+                                own,
+                                trials,
+                                *_judged(procedure, pairs, wrong, truth),
+                            )
+                        )
                     step(not own or name in settable)
     return Comparison(scores, false_alarms, calibrations)
 
 
-def simulated(exact: Pair, setting: Setting, trials: int, seed: int, use: str = "") -> tuple[Pair, np.ndarray]:
-    """The trials of a setting and which points are wrong, (trial, point); the same whatever else is asked for."""
-    place = zlib.crc32(f"{setting.layout} {setting.errors} {setting.size} {use}".encode())
+def simulated(
+    exact: Pair, setting: Setting, trials: int, seed: int, use: str = ""
+) -> tuple[Pair, np.ndarray]:
+    """The trials of a setting and which points are wrong, (trial, point); the same
+    whatever else is asked for."""
+    place = zlib.crc32(
+        f"{setting.layout} {setting.errors} {setting.size} {use}".encode()
+    )
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), place), trials)
-    pairs, wrong = Program(_simulated, {}, QUICK)((exact, keys, jnp.asarray(setting.errors), jnp.asarray(setting.size)))
+    pairs, wrong = Program(_simulated, {}, QUICK)(
+        (exact, keys, jnp.asarray(setting.errors), jnp.asarray(setting.size))
+    )
     return pairs, np.asarray(wrong)
 
 
@@ -147,22 +183,34 @@ def _simulated(plan: tuple):
 
     def one(key):
         noise, place, sign = jax.random.split(key, 3)
-        chance = jnp.where(exact.mask, jax.random.uniform(place, exact.mask.shape, float), 2.0)
+        chance = jnp.where(
+            exact.mask, jax.random.uniform(place, exact.mask.shape, float), 2.0
+        )
         wrong = (jnp.argsort(jnp.argsort(chance)) < errors) & exact.mask
         side = jnp.where(jax.random.bernoulli(sign, shape=wrong.shape), 1.0, -1.0)
         measured = noisy(exact, noise, exact.sigma[None, :])
-        return planted(measured, y_right=jnp.where(wrong, side * size * exact.sigma, 0.0)), wrong
+        return planted(
+            measured, y_right=jnp.where(wrong, side * size * exact.sigma, 0.0)
+        ), wrong
 
     return jax.vmap(one)(keys)
 
 
-def _judged(procedure: AbstractProcedure, pairs: Pair, wrong: np.ndarray, truth: RelativePose) -> tuple[Estimate, ...]:
+def _judged(
+    procedure: AbstractProcedure, pairs: Pair, wrong: np.ndarray, truth: RelativePose
+) -> tuple[Estimate, ...]:
     """The estimates of a `Score`, in its order."""
     kept, order, pose, usable, finished = clean_batch(pairs, procedure, select=_seen)
-    angle, usable = np.asarray(Program(_angles, {}, QUICK)((truth, pose))), np.asarray(usable)
+    angle, usable = (
+        np.asarray(Program(_angles, {}, QUICK)((truth, pose))),
+        np.asarray(usable),
+    )
     out = np.asarray(pairs.mask & ~kept)
     good = np.asarray(pairs.mask) & ~wrong
-    share = lambda part, whole: np.sum(part, axis=1) / np.where(np.any(whole, axis=1), np.sum(whole, axis=1), np.nan)
+    share = lambda part, whole: (
+        np.sum(part, axis=1)
+        / np.where(np.any(whole, axis=1), np.sum(whole, axis=1), np.nan)
+    )
     return (
         estimate(share(out & wrong, wrong)),
         estimate(np.any((np.asarray(order) == 1) & good, axis=1)),
@@ -176,19 +224,31 @@ def _judged(procedure: AbstractProcedure, pairs: Pair, wrong: np.ndarray, truth:
 
 def _seen(found: Rejection):
     o = found.orientation
-    return found.mask, found.order, o.pose, is_usable(o.result), found.outcome == OUTCOMES.finished
+    return (
+        found.mask,
+        found.order,
+        o.pose,
+        is_usable(o.result),
+        found.outcome == OUTCOMES.finished,
+    )
 
 
 def _angles(truth_and_poses: tuple[RelativePose, RelativePose]):
-    """The larger of the angles between the rotations and between the bases, arc minutes: 2 asin(chord / 2)."""
+    """The larger of the angles between the rotations and between the bases, arc
+    minutes: 2 asin(chord / 2)."""
     truth, poses = truth_and_poses
     rotation, base = truth.relative()
 
     def one(pose):
         other, direction = pose.relative()
-        turn = sum((a - b) ** 2 for p, q in zip(rotation, other, strict=True) for a, b in zip(p, q, strict=True))
+        turn = sum(
+            (a - b) ** 2
+            for p, q in zip(rotation, other, strict=True)
+            for a, b in zip(p, q, strict=True)
+        )
         chord = sum((a - b) ** 2 for a, b in zip(base, direction, strict=True))
-        # two rotations by an angle apart differ by sqrt(8) sin(angle / 2) in the Frobenius norm
+        # two rotations by an angle apart differ by sqrt(8) sin(angle / 2) in the
+        # Frobenius norm
         half = jnp.sqrt(jnp.maximum(turn / 8, chord / 4))
         return jnp.rad2deg(2 * jnp.arcsin(jnp.minimum(half, 1.0))) * 60
 
@@ -200,7 +260,11 @@ def estimate(values: np.ndarray) -> Estimate:
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
     mean = float(np.mean(values)) if values.size else math.nan
-    error = float(np.std(values, ddof=1) / math.sqrt(values.size)) if values.size > 1 else math.nan
+    error = (
+        float(np.std(values, ddof=1) / math.sqrt(values.size))
+        if values.size > 1
+        else math.nan
+    )
     return Estimate(mean, error)
 
 

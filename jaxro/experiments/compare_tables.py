@@ -5,33 +5,43 @@ from collections.abc import Iterator
 from itertools import groupby
 from typing import TYPE_CHECKING
 
+from ..reports.text import number, table
 from .calibration import Calibration
 from .compare import Comparison, Estimate, Score
-from .tables import number, table
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 
 def tables(comparison: Comparison) -> "Iterator[str | Table]":
-    """What `jaxro compare` prints: for every layout the procedures as they are, then at equal false alarms.
+    """What `jaxro compare` prints: for every layout the procedures as they are, then at
+    equal false alarms.
 
-    found: wrong points named. good first: pairs in which the first rejection takes a good point. exactly: pairs from
-    which all wrong points are rejected and no other.
+    found: wrong points named. good first: pairs in which the first rejection takes a
+    good point. exactly: pairs from which all wrong points are rejected and no other.
     """
     for layout, scores in groupby(comparison.scores, key=lambda s: s.setting.layout):
         here = list(scores)
-        yield f"{layout}, {here[0].trials} pairs a row; % of points or pairs ± standard error; angle to the truth, rms"
+        yield (
+            f"{layout}, {here[0].trials} pairs a row; % of points or pairs ± standard "
+            "error; angle to the truth, rms"
+        )
         yield from _both([s for s in here if not s.calibrated])
         if comparison.false_alarms:
             share = f"{100 * comparison.false_alarms:g} %"
-            yield f"{layout}, every procedure set so that {share} of the pairs without errors lose a point"
+            yield (
+                f"{layout}, every procedure set so that {share} of the pairs without "
+                "errors lose a point"
+            )
             yield _set(comparison.calibrations[layout])
             yield from _both([s for s in here if s.calibrated])
 
 
 def _both(scores: list[Score]) -> "Iterator[Table]":
-    clean, spoiled = ([s for s in scores if bool(s.setting.errors) == wrong] for wrong in (False, True))
+    clean, spoiled = (
+        [s for s in scores if bool(s.setting.errors) == wrong]
+        for wrong in (False, True)
+    )
     if clean:
         yield _clean(clean)
     if spoiled:
@@ -41,17 +51,31 @@ def _both(scores: list[Score]) -> "Iterator[Table]":
 def _clean(scores: list[Score]) -> "Table":
     rows = table("no errors", "false alarms", "good lost", "undone", "angle [']")
     for s in scores:
-        rows.add_row(s.procedure, *map(_percent, (s.alarms, s.lost, s.unfinished)), _angle(s))
+        rows.add_row(
+            s.procedure, *map(_percent, (s.alarms, s.lost, s.unfinished)), _angle(s)
+        )
     return rows
 
 
 def _spoiled(scores: list[Score]) -> "Table":
-    rows = table("errors", "procedure", "found", "good first", "good lost", "exactly", "undone", "angle [']", left=2)
+    rows = table(
+        "errors",
+        "procedure",
+        "found",
+        "good first",
+        "good lost",
+        "exactly",
+        "undone",
+        "angle [']",
+        left=2,
+    )
     for setting, members in groupby(scores, key=lambda s: s.setting):
         rows.add_section()
         title = f"{setting.errors} x {setting.size:g}σ"
         for s in members:
-            shares = map(_percent, (s.found, s.misnamed, s.lost, s.perfect, s.unfinished))
+            shares = map(
+                _percent, (s.found, s.misnamed, s.lost, s.perfect, s.unfinished)
+            )
             rows.add_row(title, s.procedure, *shares, _angle(s))
             title = ""
     return rows
@@ -73,7 +97,12 @@ def _angle(s: Score) -> str:
 
 
 def _with_error(value: float, error: float, digits: int) -> str:
-    """The value and its standard error, which a single trial does not have; a dash for what does not exist."""
+    """The value and its standard error, which a single trial does not have; a dash for
+    what does not exist."""
     if math.isnan(value):
         return "-"
-    return number(value, digits) if math.isnan(error) else f"{number(value, digits)} ±{number(error, digits)}"
+    return (
+        number(value, digits)
+        if math.isnan(error)
+        else f"{number(value, digits)} ±{number(error, digits)}"
+    )

@@ -1,9 +1,12 @@
-"""The tables and examples of Dorozhinsky (1971), calculated again and held against the print.
+"""The tables and examples of Dorozhinsky (1971), calculated again and held against the
+print.
 
-Table 1 is a flat mock pair, f = b = y = 70 mm, vertical photos, points exactly in their zones. Two of its facts had to
-be recovered: the errors of points 9 and 10 are negative, and its column n = 16 carries an error of -0.60 mm at point 15
-that the table does not list. The pair of table 2 is recovered as well: its elements, its size, and the errors of points
-7 and 8. All errors are of the right-hand y; residual parallaxes are shown in hundredths of a millimetre.
+Table 1 is a flat mock pair, f = b = y = 70 mm, vertical photos, points exactly in their
+zones. Two of its facts had to be recovered: the errors of points 9 and 10 are negative,
+and its column n = 16 carries an error of -0.60 mm at point 15 that the table does not
+list. The pair of table 2 is recovered as well: its elements, its size, and the errors
+of points 7 and 8. All errors are of the right-hand y; residual parallaxes are shown in
+hundredths of a millimetre.
 """
 
 from dataclasses import dataclass
@@ -14,13 +17,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .. import simulation
-from ..batch import clean_batch
-from ..elements import IndependentElements
-from ..pairs import Pair, pad, stack
-from ..programs import QUICK, Program
+from ..batches.batch import clean_batch
+from ..geometry import mock_pairs
+from ..geometry.elements import IndependentElements
+from ..geometry.pairs import Pair, pad, stack
 from ..rejection import OUTCOMES, Dorozhinsky, base
 from ..rejection.leave_one_out_grubbs import linearised
+from ..xla.programs import QUICK, Program
 from .dorozhinsky1971_first_order import EQUATIONS, by_the_papers_rule
 
 ERRORS = (0.0, 0, 0, 0, 0, 0, 2.0, 2.2, -2.43, -1.90, 0, 0, 0, 0, -0.60, 2.1)
@@ -35,7 +38,14 @@ TABLE_1 = {
     16: (49, 31, 78, 63, -90, -110, -118, -158, 146, 79, 47, 31, 63, 78, -28, -158),
 }
 """As printed; the sign at point 5 of n = 9 is a misprint."""
-MEAN_AND_M_Q = {6: (0, 0), 7: (36, 98), 8: (54, 117), 9: (79, 135), 10: (86, 134), 16: (83, 112)}
+MEAN_AND_M_Q = {
+    6: (0, 0),
+    7: (36, 98),
+    8: (54, 117),
+    9: (79, 135),
+    10: (86, 134),
+    16: (83, 112),
+}
 
 TABLE_2 = (
     (-127, -107, -216, -162, -102, -117, -326, -282),
@@ -55,19 +65,23 @@ TABLE_2_ELEMENTS = (
 IN_THE_ORDER_OF_THE_PAPER = (0, 1, 3, 2, 4)
 
 TEN_POINTS = (13, -20, -94, 11, -9, 10, -98, -20, 11, -9)
-"""Residuals of the ten points in the introduction, as printed: an error at point 7, in the zone of point 3.
+"""Residuals of the ten points in the introduction, as printed: an error at point 7, in
+the zone of point 3.
 
-The error is printed as -2.0 mm and is +2.0 mm in the sign of table 1; so -94 at point 3 stands for 94.
+The error is printed as -2.0 mm and is +2.0 mm in the sign of table 1; so -94 at point 3
+stands for 94.
 """
 TEN_ZONES = (1, 2, 3, 4, 5, 6, 3, 2, 4, 5)
 TEN_TOLERANCE = 0.01
 """mm, of condition (3)."""
 
 READINGS = (1, 2)
-"""Corrections of the elements before a point is judged. The paper's "two iterations" are one correction, as its table 2
-says; two corrections are the other reading of its text."""
+"""Corrections of the elements before a point is judged. The paper's "two iterations"
+are one correction, as its table 2 says; two corrections are the other reading of its
+text."""
 NOISY, NOISE = 150, 0.01
-"""Pairs of eight points with errors of 2.0 and 2.2 mm at points 7 and 8 and noise (mm) in all coordinates."""
+"""Pairs of eight points with errors of 2.0 and 2.2 mm at points 7 and 8 and noise (mm)
+in all coordinates."""
 
 EXAMPLE = (0.01,) * 9 + (0.10,)
 """mm; the paper rounds m_q to .045 and 3 m_q to .13."""
@@ -75,7 +89,8 @@ EXAMPLE = (0.01,) * 9 + (0.10,)
 
 @dataclass(frozen=True)
 class Decision:
-    """What the proposed algorithm did: numbers of the points rejected, in order; mean |q| of those kept (mm)."""
+    """What the proposed algorithm did: numbers of the points rejected, in order; mean
+    |q| of those kept (mm)."""
 
     rejected: list[int]
     left: float
@@ -84,7 +99,8 @@ class Decision:
 
 @dataclass(frozen=True)
 class Column:
-    """One number of points of table 1: residuals (mm), and the decision by the number of corrections."""
+    """One number of points of table 1: residuals (mm), and the decision by the number
+    of corrections."""
 
     points: int
     parallax: np.ndarray
@@ -101,10 +117,11 @@ class Column:
 class Results:
     """Everything calculated: mm, arc minutes, 36ths.
 
-    `pair_of_table_2`: decisions on the pair of table 2, whose points 7 and 8 are wrong. `named_exactly`: share of the
-    noisy pairs of eight points from which exactly points 7 and 8 were rejected. Both by the number of corrections.
-    `least_squares`, `own_rule`: residuals of (9) and (10). `ten`: residuals of the ten points of the introduction, of
-    which condition (3) rejects `ten_rejected`.
+    `pair_of_table_2`: decisions on the pair of table 2, whose points 7 and 8 are wrong.
+    `named_exactly`: share of the noisy pairs of eight points from which exactly points
+    7 and 8 were rejected. Both by the number of corrections. `least_squares`,
+    `own_rule`: residuals of (9) and (10). `ten`: residuals of the ten points of the
+    introduction, of which condition (3) rejects `ten_rejected`.
     """
 
     columns: list[Column]
@@ -121,14 +138,25 @@ class Results:
 
 def run() -> Results:
     """Calculate all of it; the noisy pairs have a fixed seed."""
-    pairs, strict, (parallax, elements), influence = Program(_calculated, {}, QUICK)(jnp.asarray(ERRORS))
+    pairs, strict, (parallax, elements), influence = Program(_calculated, {}, QUICK)(
+        jnp.asarray(ERRORS)
+    )
     q, m_q = map(np.asarray, strict)
-    decisions = {corrections: _decisions(pairs, corrections) for corrections in READINGS}
-    by_row = lambda row: {corrections: found[row] for corrections, found in decisions.items()}
-    columns = [Column(n, q[row, :n], float(m_q[row]), by_row(row)) for row, n in enumerate(TABLE_1)]
+    decisions = {
+        corrections: _decisions(pairs, corrections) for corrections in READINGS
+    }
+    by_row = lambda row: {
+        corrections: found[row] for corrections, found in decisions.items()
+    }
+    columns = [
+        Column(n, q[row, :n], float(m_q[row]), by_row(row))
+        for row, n in enumerate(TABLE_1)
+    ]
     second, ten, noisy = len(TABLE_1), len(TABLE_1) + 1, len(TABLE_1) + 2
     exactly = {
-        corrections: float(np.mean([set(one.rejected) == {7, 8} for one in found[noisy:]]))
+        corrections: float(
+            np.mean([set(one.rejected) == {7, 8} for one in found[noisy:]])
+        )
         for corrections, found in decisions.items()
     }
     in_minutes = np.rad2deg(np.asarray(elements)) * 60
@@ -140,7 +168,9 @@ def run() -> Results:
         elements=in_minutes[:, list(IN_THE_ORDER_OF_THE_PAPER)],
         pair_of_table_2=by_row(second),
         named_exactly=exactly,
-        least_squares={equation: 36 * np.asarray(influence[equation]) for equation in EQUATIONS},
+        least_squares={
+            equation: 36 * np.asarray(influence[equation]) for equation in EQUATIONS
+        },
         own_rule={equation: by_the_papers_rule(equation) for equation in EQUATIONS},
         ten=ten_q,
         ten_rejected=[int(i) + 1 for i in np.flatnonzero(too_large)],
@@ -149,18 +179,22 @@ def run() -> Results:
 
 
 def _calculated(errors):
-    """All pairs as a batch, their strict solutions, the iterations of table 2, and the influences.
+    """All pairs as a batch, their strict solutions, the iterations of table 2, and the
+    influences.
 
-    The batch: table 1, the pair of table 2, the ten points of the introduction, the noisy pairs.
+    The batch: table 1, the pair of table 2, the ten points of the introduction, the
+    noisy pairs.
     """
     most = table_1(errors)
     masks = jnp.arange(max(TABLE_1))[None, :] < jnp.array(list(TABLE_1))[:, None]
     first = jax.vmap(most.with_mask)(masks)
     two = pad(table_1(errors[:8]), max(TABLE_1))
     keys = jax.random.split(jax.random.key(1971), NOISY)
-    noisy = jax.vmap(lambda key: simulation.noisy(two, key, NOISE))(keys)
+    noisy = jax.vmap(lambda key: mock_pairs.noisy(two, key, NOISE))(keys)
     single = [pad(one, max(TABLE_1)) for one in (table_2(), ten_points())]
-    pairs = jax.tree.map(lambda *parts: jnp.concatenate(parts), first, stack(single), noisy)
+    pairs = jax.tree.map(
+        lambda *parts: jnp.concatenate(parts), first, stack(single), noisy
+    )
     return (
         pairs,
         jax.vmap(_strict)(pairs),
@@ -171,23 +205,27 @@ def _calculated(errors):
 
 def ten_points() -> Pair:
     """The ten points of the introduction, an error of +2.0 mm at point 7."""
-    x, y = zip(*(simulation.ZONES[zone] for zone in TEN_ZONES), strict=True)
-    flat = simulation.mock_pair(simulation.Layout(x, y, TEN_ZONES))
-    return simulation.planted(flat, y_right=2.0 * (np.arange(len(TEN_ZONES)) == 6))
+    x, y = zip(*(mock_pairs.ZONES[zone] for zone in TEN_ZONES), strict=True)
+    flat = mock_pairs.mock_pair(mock_pairs.Layout(x, y, TEN_ZONES))
+    return mock_pairs.planted(flat, y_right=2.0 * (np.arange(len(TEN_ZONES)) == 6))
 
 
 def table_1(errors: Float[Array, "point"]) -> Pair:
     """The mock pair of table 1 with as many points as errors are given."""
-    return simulation.planted(simulation.mock_pair(simulation.standard_layout(len(errors))), y_right=errors)
+    return mock_pairs.planted(
+        mock_pairs.mock_pair(mock_pairs.standard_layout(len(errors))), y_right=errors
+    )
 
 
 def table_2() -> Pair:
     """The mock pair of table 2."""
     minutes = (12.79, 36.24, -19.22, 32.89, 46.01)
     elements = IndependentElements(*(jnp.deg2rad(jnp.asarray(m) / 60) for m in minutes))
-    layout = simulation.standard_layout(8)
-    flat = simulation.mock_pair(layout, elements, focal=70.64, base=63.99, y_range=(64.07, 62.32))
-    return simulation.planted(flat, y_right=np.array([0, 0, 0, 0, 0, 0, 1.10, 1.20]))
+    layout = mock_pairs.standard_layout(8)
+    flat = mock_pairs.mock_pair(
+        layout, elements, focal=70.64, base=63.99, y_range=(64.07, 62.32)
+    )
+    return mock_pairs.planted(flat, y_right=np.array([0, 0, 0, 0, 0, 0, 1.10, 1.20]))
 
 
 def _decisions(pairs: Pair, corrections: int) -> list[Decision]:
@@ -196,9 +234,13 @@ def _decisions(pairs: Pair, corrections: int) -> list[Decision]:
     names = {int(item._value): name for name, item in OUTCOMES._name_to_item.items()}
     decisions = []
     for row in range(len(order)):
-        rejected = sorted(np.flatnonzero(order[row]), key=lambda i, row=row: order[row, i])
+        rejected = sorted(
+            np.flatnonzero(order[row]), key=lambda i, row=row: order[row, i]
+        )
         mean = float(np.sum(np.abs(q[row][kept[row]])) / np.sum(kept[row]))
-        decisions.append(Decision([int(i) + 1 for i in rejected], mean, names[int(outcome[row])]))
+        decisions.append(
+            Decision([int(i) + 1 for i in rejected], mean, names[int(outcome[row])])
+        )
     return decisions
 
 
@@ -222,9 +264,12 @@ def _iterations(pair: Pair):
 
 
 def _influence(equation: int):
-    """What an error of point 7 leaves, (1 - H) of its column, H = A (AᵀA)⁻¹ Aᵀ: a law of the layout."""
+    """What an error of point 7 leaves, (1 - H) of its column, H = A (AᵀA)⁻¹ Aᵀ: a law
+    of the layout."""
     zones, _ = EQUATIONS[equation]
-    x, y = zip(*(simulation.ZONES[zone] for zone in zones), strict=True)
-    flat = simulation.mock_pair(simulation.Layout(x, y, zones))
+    x, y = zip(*(mock_pairs.ZONES[zone] for zone in zones), strict=True)
+    flat = mock_pairs.mock_pair(mock_pairs.Layout(x, y, zones))
     _, (a, z), _ = linearised(flat, flat.mask, base.zero_elements(flat))
-    return jnp.eye(len(zones))[6] - sum(column * solved[6] for column, solved in zip(a, z, strict=True))
+    return jnp.eye(len(zones))[6] - sum(
+        column * solved[6] for column, solved in zip(a, z, strict=True)
+    )

@@ -10,15 +10,20 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from .. import coplanarity
 from ..adjustment.normal_equations import steps
 from ..adjustment.residuals import Residuals
-from ..elements import AbstractElements, IndependentElements, RelativePose, convert
-from ..orientation import Orientation, orient
-from ..pairs import Pair
-from ..programs import while_loop
-from ..reductions import count, total
-from ..results import is_usable
+from ..geometry import coplanarity
+from ..geometry.elements import (
+    AbstractElements,
+    IndependentElements,
+    RelativePose,
+    convert,
+)
+from ..geometry.pairs import Pair
+from ..orientation.orient import Orientation, orient
+from ..orientation.results import is_usable
+from ..xla.programs import while_loop
+from ..xla.reductions import count, total
 
 PointValues = Float[Array, "*pairs point"]
 
@@ -28,36 +33,48 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
     finished = ""
     operator_needed = (
-        "Six points are left and their mean residual parallax is still above the tolerance: an operator has to look "
+        "Six points are left and their mean residual parallax is still above the "
+        "tolerance: an operator has to look "
         "at this pair."
     )
     nothing_to_test = "The procedure does not apply: too few points to reject any."
     no_consensus = (
-        "No orientation was found that so many points agree with that it cannot be an accident: what is kept and "
-        "rejected here proves nothing. Measure more points, and see whether the standard deviation is the right one."
+        "No orientation was found that so many points agree with that it cannot be an "
+        "accident: what is kept and "
+        "rejected here proves nothing. Measure more points, and see whether the "
+        "standard deviation is the right one."
     )
     did_not_rest = (
-        "The weights did not come to rest, so that the points rejected depend on the number of rounds. Use another "
+        "The weights did not come to rest, so that the points rejected depend on the "
+        "number of rounds. Use another "
         "weight function, or the procedure `recommended`."
     )
     no_choice = (
-        "No choice of so few omissions as are tried passes the global test: more points are wrong, or the standard "
+        "No choice of so few omissions as are tried passes the global test: more "
+        "points are wrong, or the standard "
         "deviation is too small. Use the procedure `recommended`."
     )
     undecided = (
-        "One more point is wrong, and the others do not tell which: leaving out any one of those that are named "
-        "explains the misfit as well, so that none of them is rejected. Measure them again, or more points beside them."
+        "One more point is wrong, and the others do not tell which: leaving out any "
+        "one of those that are named "
+        "explains the misfit as well, so that none of them is rejected. Measure them "
+        "again, or more points beside them."
     )
-    not_oriented = "The points that were kept do not orient the pair; see the result of its orientation."
+    not_oriented = (
+        "The points that were kept do not orient the pair; see the result of its "
+        "orientation."
+    )
 
 
 class Log(eqx.Module):
-    """The decisions by round, (round, ...) each; rounds that did not take place are zero.
+    """The decisions by round, (round, ...) each; rounds that did not take place are
+    zero.
 
     A round with an infinite limit is an iteration and no decision.
 
-    `statistic` of every point (inf: wrong by any measure), the `limit` it was held against, the points `rejected`, the
-    residual `parallax` (of points in use) and the `elements` (phi1, kappa1, omega2, phi2, kappa2) it was judged by.
+    `statistic` of every point (inf: wrong by any measure), the `limit` it was held
+    against, the points `rejected`, the residual `parallax` (of points in use) and the
+    `elements` (phi1, kappa1, omega2, phi2, kappa2) it was judged by.
     """
 
     happened: Bool[Array, "*pairs round"]
@@ -71,9 +88,10 @@ class Log(eqx.Module):
 class Rejection(eqx.Module):
     """What a procedure decided; for a batch every field has leading axes.
 
-    `mask`: points kept. `order`: 1 for the points rejected first, 2 for the next, ...; 0 for those kept.
-    `statistic`: of every point, in the round that rejected it or else in the last one. `orientation`: of the points
-    kept. `undecided`: points of which one is wrong, though nothing tells which; they are kept.
+    `mask`: points kept. `order`: 1 for the points rejected first, 2 for the next, ...;
+    0 for those kept. `statistic`: of every point, in the round that rejected it or else
+    in the last one. `orientation`: of the points kept. `undecided`: points of which one
+    is wrong, though nothing tells which; they are kept.
     """
 
     mask: Bool[Array, "*pairs point"]
@@ -85,13 +103,17 @@ class Rejection(eqx.Module):
     undecided: Bool[Array, "*pairs point"]
 
     def only_if(self, fine: Bool[Array, ""], otherwise: OUTCOMES) -> "Rejection":
-        """The same decision, with another outcome where it is not fine and there was something to test."""
-        outcome = OUTCOMES.where(fine | (self.outcome == OUTCOMES.nothing_to_test), self.outcome, otherwise)
+        """The same decision, with another outcome where it is not fine and there was
+        something to test."""
+        outcome = OUTCOMES.where(
+            fine | (self.outcome == OUTCOMES.nothing_to_test), self.outcome, otherwise
+        )
         return dataclasses.replace(self, outcome=outcome)
 
     def taking_back(self, named: Bool[Array, "point"]) -> "Rejection":
-        """The same decision, if it is finished, with the outcome `undecided` between the points named, none of which is
-        rejected. The orientation stays the one without those that were."""
+        """The same decision, if it is finished, with the outcome `undecided` between
+        the points named, none of which is rejected. The orientation stays the one
+        without those that were."""
         finished = self.outcome == OUTCOMES.finished
         named = named & finished
         any_named = count(named) > 0
@@ -105,7 +127,8 @@ class Rejection(eqx.Module):
 
 
 class AbstractProcedure(eqx.Module):
-    """A rule that finds wrong points in one pair; tolerances are its fields, lengths in the unit of the coordinates."""
+    """A rule that finds wrong points in one pair; tolerances are its fields, lengths in
+    the unit of the coordinates."""
 
     @abc.abstractmethod
     def __call__(self, pair: Pair) -> Rejection:
@@ -138,12 +161,16 @@ def began(pair: Pair, rounds: int) -> History:
     n = pair.x_left.shape[0]
     zero = pair.focal_left * 0
     wide = jnp.zeros((rounds, n)) + zero
-    log = Log(wide[:, 0] > 1, wide, wide[:, 0], wide > 1, wide, jnp.zeros((rounds, 5)) + zero)
+    log = Log(
+        wide[:, 0] > 1, wide, wide[:, 0], wide > 1, wide, jnp.zeros((rounds, 5)) + zero
+    )
     none = jnp.zeros_like(pair.mask, int)
     return History(pair.mask, none, pair.x_left * 0, log, jnp.sum(none), jnp.sum(none))
 
 
-def recorded(history: History, new: Round, active: Bool[Array, ""] | bool = True) -> History:
+def recorded(
+    history: History, new: Round, active: Bool[Array, ""] | bool = True
+) -> History:
     """The history after one more round (unchanged where it is not `active`)."""
     here = (jnp.arange(history.log.limit.shape[0]) == history.rounds) & active
     log = Log(
@@ -172,7 +199,9 @@ def recorded(history: History, new: Round, active: Bool[Array, ""] | bool = True
     )
 
 
-def repeated(judge: Callable[[Bool[Array, "point"], History], Round], history: History) -> History:
+def repeated(
+    judge: Callable[[Bool[Array, "point"], History], Round], history: History
+) -> History:
     """Rounds until one rejects nothing, or the log is full."""
     most = history.log.limit.shape[0]
 
@@ -186,16 +215,20 @@ def repeated(judge: Callable[[Bool[Array, "point"], History], Round], history: H
         return recorded(history, new), count(new.rejected) > 0
 
     start = history, jnp.asarray(most > 0) & (count(history.mask) > 0)
-    return while_loop(more, body, start, jnp.sum(history.log.limit))[0]  # any number that differs from pair to pair
+    return while_loop(more, body, start, jnp.sum(history.log.limit))[
+        0
+    ]  # any number that differs from pair to pair
 
 
 def largest(values: PointValues, use: Bool[Array, "point"]) -> Bool[Array, "point"]:
-    """Whether a point has the largest value of those in use; of equal ones the first."""
+    """Whether a point has the largest value of those in use; of equal ones the
+    first."""
     return use & (ranks(values, use) == 0)
 
 
 def ranks(values: PointValues, use: Bool[Array, "point"]) -> Int[Array, "point"]:
-    """How many of the points in use have a larger value (or an equal one and stand before)."""
+    """How many of the points in use have a larger value (or an equal one and stand
+    before)."""
     index = jnp.arange(values.shape[0])
     before = (values[None, :] > values[:, None]) | (
         (values[None, :] == values[:, None]) & (index[None, :] < index[:, None])
@@ -203,7 +236,12 @@ def ranks(values: PointValues, use: Bool[Array, "point"]) -> Int[Array, "point"]
     return jnp.sum(jnp.where(before & use[None, :], 1, 0), axis=1)
 
 
-def at_most(rejected: Bool[Array, "point"], values: PointValues, use: Bool[Array, "point"], least: int):
+def at_most(
+    rejected: Bool[Array, "point"],
+    values: PointValues,
+    use: Bool[Array, "point"],
+    least: int,
+):
     """The rejected points of largest value, so many that `least` points stay."""
     allowed = jnp.sum(jnp.where(use, 1, 0)) - least
     return rejected & (ranks(values, rejected) < allowed)
@@ -221,10 +259,20 @@ def zero_elements(pair: Pair) -> IndependentElements:
 
 
 def by_parallax(
-    pair: Pair, mask: Bool[Array, "point"], start: AbstractElements | None = None, max_steps: int = 30
+    pair: Pair,
+    mask: Bool[Array, "point"],
+    start: AbstractElements | None = None,
+    max_steps: int = 30,
 ) -> Orientation:
-    """The strict orientation of the papers: q of unit weight, independent elements, from zero if no start is given."""
-    unit = Pair(*pair.coordinates, jnp.ones_like(pair.sigma), pair.mask, pair.focal_left, pair.focal_right)
+    """The strict orientation of the papers: q of unit weight, independent elements,
+    from zero if no start is given."""
+    unit = Pair(
+        *pair.coordinates,
+        jnp.ones_like(pair.sigma),
+        pair.mask,
+        pair.focal_left,
+        pair.focal_right,
+    )
     return orient(
         unit.with_mask(mask),
         elements=IndependentElements,
@@ -234,20 +282,35 @@ def by_parallax(
     )
 
 
-def parallaxes(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements) -> PointValues:
+def parallaxes(
+    pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements
+) -> PointValues:
     """q of the points in use at given elements."""
     return residuals_at(pair, mask, elements)((jnp.zeros_like(pair.focal_left),) * 5)
 
 
-def iterated(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements) -> AbstractElements:
+def iterated(
+    pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements
+) -> AbstractElements:
     """The elements after one iteration of the strict solution."""
     zero = (jnp.zeros_like(pair.focal_left),) * 5
-    return elements.moved(steps(residuals_at(pair, mask, elements), zero, 1, float("inf")))
+    return elements.moved(
+        steps(residuals_at(pair, mask, elements), zero, 1, float("inf"))
+    )
 
 
-def residuals_at(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements) -> Residuals:
-    """The parallaxes of the points in use as a function of a displacement of the elements."""
-    unit = Pair(*pair.coordinates, jnp.ones_like(pair.sigma), pair.mask, pair.focal_left, pair.focal_right)
+def residuals_at(
+    pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements
+) -> Residuals:
+    """The parallaxes of the points in use as a function of a displacement of the
+    elements."""
+    unit = Pair(
+        *pair.coordinates,
+        jnp.ones_like(pair.sigma),
+        pair.mask,
+        pair.focal_left,
+        pair.focal_right,
+    )
     prepare, condition, observations, cofactor = coplanarity.parallax(unit)
     return Residuals(prepare, condition, elements, observations, cofactor, mask)
 
@@ -268,13 +331,15 @@ def ended(
     outcome: OUTCOMES,
     undecided: Bool[Array, "point"] | None = None,
 ) -> Rejection:
-    """The verdict. Where the procedure finished, `not_oriented` if the points kept do not orient the pair, and
-    `undecided` if there are such points."""
+    """The verdict. Where the procedure finished, `not_oriented` if the points kept do
+    not orient the pair, and `undecided` if there are such points."""
     none = jnp.zeros_like(history.mask)
     fine = outcome == OUTCOMES.finished
     named = none if undecided is None else undecided & fine
     outcome = OUTCOMES.where(count(named) > 0, OUTCOMES.undecided, outcome)
-    outcome = OUTCOMES.where(fine & ~is_usable(orientation.result), OUTCOMES.not_oriented, outcome)
+    outcome = OUTCOMES.where(
+        fine & ~is_usable(orientation.result), OUTCOMES.not_oriented, outcome
+    )
     return Rejection(
         mask=history.mask,
         order=history.order,

@@ -1,9 +1,12 @@
-"""The orientations of many subsets of five points, solved together: the hypotheses of a search.
+"""The orientations of many subsets of five points, solved together: the hypotheses of a
+search.
 
-The equations are those of `starts.five_point` (Nister 2004). A search can do without some solutions if the others come
-sooner, so that two steps differ. The cubics are eliminated without pivots. The real roots of the polynomial of degree
-ten are sought where it changes its sign between NODES places of the projective line, so that two roots that lie closer
-together are lost: one subset of seven loses the right orientation. What is found is right to some thousandths.
+The equations are those of `starts.five_point` (Nister 2004). A search can do without
+some solutions if the others come sooner, so that two steps differ. The cubics are
+eliminated without pivots. The real roots of the polynomial of degree ten are sought
+where it changes its sign between NODES places of the projective line, so that two roots
+that lie closer together are lost: one subset of seven loses the right orientation. What
+is found is right to some thousandths.
 
 Arrays carry the subsets on their last axis.
 """
@@ -15,9 +18,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ..starts.decomposition import cofactors
-from ..starts.five_point import constraints, determinant, essential_coefficients
-from ..starts.problems_last import cross, merging_last
+from ..orientation.starts.decomposition import cofactors
+from ..orientation.starts.five_point import (
+    constraints,
+    determinant,
+    essential_coefficients,
+)
+from ..orientation.starts.problems_last import cross, merging_last
 
 SOLUTIONS = 10
 """Real solutions that five points may have."""
@@ -38,7 +45,8 @@ Numbers = Float[Array, " subset"]
 
 
 class Solutions(NamedTuple):
-    """Orientations by solution and subset, and which of them exist with all five points in front of both photos."""
+    """Orientations by solution and subset, and which of them exist with all five points
+    in front of both photos."""
 
     rotation: Float[Array, "solution 3 3 subset"]
     base: Float[Array, "solution 3 subset"]
@@ -46,8 +54,8 @@ class Solutions(NamedTuple):
 
 
 class Brackets(NamedTuple):
-    """The intervals in which the polynomial changes its sign: their ordinal numbers (0: no change), where a straight
-    line meets zero, and how many there are."""
+    """The intervals in which the polynomial changes its sign: their ordinal numbers (0:
+    no change), where a straight line meets zero, and how many there are."""
 
     ordinal: Int[Array, "interval subset"]
     crossing: Float[Array, "interval subset"]
@@ -70,17 +78,22 @@ def solve(left: Image, right: Image) -> Solutions:
         rotation, base, in_front = _facing(essential, left, right)
         return rotation, base, in_front & (number < brackets.count)
 
-    return Solutions(*lax.map(solution, jnp.arange(SOLUTIONS, dtype=brackets.count.dtype)))
+    return Solutions(
+        *lax.map(solution, jnp.arange(SOLUTIONS, dtype=brackets.count.dtype))
+    )
 
 
 def _basis(rows: Float[Array, "5 9 subset"]) -> Float[Array, "4 9 subset"]:
-    """Four orthonormal vectors at right angles to five rows: elimination without pivots, then Gram and Schmidt."""
+    """Four orthonormal vectors at right angles to five rows: elimination without
+    pivots, then Gram and Schmidt."""
     m = rows
     for k in range(5):
         row = m[k] / _safe(m[k, k])[None]
         this = jnp.asarray(np.arange(5) == k)[:, None, None]
         m = jnp.where(this, row[None], m - m[:, k][:, None] * row[None])
-    identity = jnp.broadcast_to(jnp.eye(4, dtype=rows.dtype)[:, :, None], (4, 4, rows.shape[-1]))
+    identity = jnp.broadcast_to(
+        jnp.eye(4, dtype=rows.dtype)[:, :, None], (4, 4, rows.shape[-1])
+    )
     found: list[Array] = []
     for vector in jnp.concatenate([-jnp.swapaxes(m[:, 5:], 0, 1), identity], axis=1):
         for other in found:
@@ -90,7 +103,8 @@ def _basis(rows: Float[Array, "5 9 subset"]) -> Float[Array, "4 9 subset"]:
 
 
 def _eliminated(m: Float[Array, "10 20 subset"]) -> Float[Array, "3 3 5 subset"]:
-    """B(z) of three equations B (x, y, 1)ᵀ = 0, [equation, unknown, power of z], from the last six reduced rows."""
+    """B(z) of three equations B (x, y, 1)ᵀ = 0, [equation, unknown, power of z], from
+    the last six reduced rows."""
     number = jnp.arange(10)[:, None, None]
 
     def step(k: Int[Array, ""], m: Array) -> Array:
@@ -109,7 +123,8 @@ def _eliminated(m: Float[Array, "10 20 subset"]) -> Float[Array, "3 3 5 subset"]
 
 
 def _bracketed(c: Float[Array, "11 subset"]) -> Brackets:
-    """Where the sum of c_k z^k w^(10-k) changes its sign: for z in [-1, 1] with w = 1, then for w with z = 1."""
+    """Where the sum of c_k z^k w^(10-k) changes its sign: for z in [-1, 1] with w = 1,
+    then for w with z = 1."""
     powers = jnp.asarray(POWERS, c.dtype)
     halves = [jnp.dot(powers, c), jnp.dot(powers, c[::-1])]
     low = jnp.concatenate([half[:-1] for half in halves])
@@ -121,8 +136,11 @@ def _bracketed(c: Float[Array, "11 subset"]) -> Brackets:
     return Brackets(ordinal, crossing, jnp.max(ordinal, axis=0))
 
 
-def _root(c: Float[Array, "11 subset"], brackets: Brackets, number: Int[Array, ""]) -> tuple[Numbers, Numbers]:
-    """(z, w) of the root in the bracket of this number, by Newton's method kept in the bracket."""
+def _root(
+    c: Float[Array, "11 subset"], brackets: Brackets, number: Int[Array, ""]
+) -> tuple[Numbers, Numbers]:
+    """(z, w) of the root in the bracket of this number, by Newton's method kept in the
+    bracket."""
     here = brackets.ordinal == number + 1
     second = jnp.any(here & jnp.asarray(IN_SECOND_HALF), axis=0)
     low = jnp.sum(jnp.where(here, jnp.asarray(LEFT_EDGES, c.dtype), 0.0), axis=0)
@@ -138,32 +156,48 @@ def _root(c: Float[Array, "11 subset"], brackets: Brackets, number: Int[Array, "
 
 
 def _facing(essential: Float[Array, "3 3 subset"], left: Image, right: Image):
-    """Of the four orientations of E = -[b]x R the one with all points in front, and whether there is one (Horn 1990:
-    cof(E) is b times a row; (b . b) R = cof(E) + [b]x E, and cof(E) - [b]x E for -b)."""
+    """Of the four orientations of E = -[b]x R the one with all points in front, and
+    whether there is one (Horn 1990: cof(E) is b times a row; (b . b) R = cof(E) + [b]x
+    E, and cof(E) - [b]x E for -b)."""
     columns = cofactors(essential)
     rows = jnp.swapaxes(columns, 0, 1)
     length = jnp.sum(rows * rows, axis=1)
     first = (length[:1] >= length[1:2]) & (length[:1] >= length[2:])
-    base = _unit(jnp.where(first, rows[0], jnp.where(length[1:2] >= length[2:], rows[1], rows[2])))
-    # E has the length of its b, unknown here: with unit b both parts of R need the same scale
+    base = _unit(
+        jnp.where(
+            first, rows[0], jnp.where(length[1:2] >= length[2:], rows[1], rows[2])
+        )
+    )
+    # E has the length of its b, unknown here: with unit b both parts of R need the same
+    # scale
     scale = jnp.sqrt(jnp.maximum(jnp.sum(essential * essential, axis=(0, 1)) / 2, TINY))
     across = cross(base[:, None], essential) * scale[None, None]
     one, other = columns + across, columns - across
-    (ahead, behind), (also_ahead, also_behind) = (_in_front(r, base, left, right) for r in (one, other))
+    (ahead, behind), (also_ahead, also_behind) = (
+        _in_front(r, base, left, right) for r in (one, other)
+    )
     second = also_ahead | also_behind
     rotation = jnp.where(second[None, None], other, one) / (scale * scale)[None, None]
     turned = jnp.where(second, also_behind, behind)
     return rotation, jnp.where(turned[None], -base, base), ahead | behind | second
 
 
-def _in_front(rotation: Float[Array, "3 3 subset"], base: Float[Array, "3 subset"], left: Image, right: Image):
-    """Whether all five points lie in front of both photos with the base b, and with -b."""
+def _in_front(
+    rotation: Float[Array, "3 3 subset"],
+    base: Float[Array, "3 subset"],
+    left: Image,
+    right: Image,
+):
+    """Whether all five points lie in front of both photos with the base b, and with
+    -b."""
     p1 = jnp.swapaxes(left, 0, 1)
     p2 = jnp.sum(rotation[:, :, None] * jnp.swapaxes(right, 0, 1)[None], axis=1)
     normal = cross(p1, p2)
     first = jnp.sum(cross(base[:, None], p2) * normal, axis=0)
     second = jnp.sum(cross(base[:, None], p1) * normal, axis=0)
-    return jnp.all((first > 0) & (second > 0), axis=0), jnp.all((first < 0) & (second < 0), axis=0)
+    return jnp.all((first > 0) & (second > 0), axis=0), jnp.all(
+        (first < 0) & (second < 0), axis=0
+    )
 
 
 def _safe(pivot: Array) -> Array:

@@ -1,23 +1,27 @@
-"""Graduated non-convexity: truncated least squares from a convex beginning (Blake and Zisserman 1987, Yang 2020)."""
+"""Graduated non-convexity: truncated least squares from a convex beginning (Blake and
+Zisserman 1987, Yang 2020)."""
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..conditions import linearised
-from ..elements import RelativePose
-from ..pairs import Pair, cleaned
-from ..starts import AbstractStart, Vertical
+from ..geometry.elements import RelativePose
+from ..geometry.linear import linearised
+from ..geometry.pairs import Pair, cleaned
+from ..orientation.starts import AbstractStart, Vertical
 from .base import Rejection
 from .robust import AbstractSearch, agreeing, in_single, judged, reweighted, scaled
 
 
 class GraduatedNonConvexity(AbstractSearch):
-    """Minimise Σ min(s, c²), s = (r/sigma)², c = `limit`, from absolute residuals over a loss that slowly lets go.
+    """Minimise Σ min(s, c²), s = (r/sigma)², c = `limit`, from absolute residuals over
+    a loss that slowly lets go.
 
-    `absolute` steps with weights 1/|r|; `graded` steps of Geman-McClure, weight (k²/(k² + s))², its k falling from
-    `widest` to c in equal ratios; then `rounds` turns of least squares on the points with |w| <= c. Needs no subsets:
-    its work grows with n. From about fifty points it stands half of them wrong; with sixteen, a fifth not always.
+    `absolute` steps with weights 1/|r|; `graded` steps of Geman-McClure, weight (k²/(k²
+    + s))², its k falling from `widest` to c in equal ratios; then `rounds` turns of
+    least squares on the points with |w| <= c. Needs no subsets: its work grows with n.
+    From about fifty points it stands half of them wrong; with sixteen, a fifth not
+    always.
     """
 
     sigma: float | None = None
@@ -33,7 +37,9 @@ class GraduatedNonConvexity(AbstractSearch):
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = self.search(fixed)
         use = fixed.mask & (linearised(fixed, pose).squares <= self.limit**2)
-        return judged(pair, *agreeing(fixed, pose, use, self.limit, self.rounds), self.limit)
+        return judged(
+            pair, *agreeing(fixed, pose, use, self.limit, self.rounds), self.limit
+        )
 
     def search(self, pair: Pair) -> RelativePose:
         """The pose after all graded steps, which are as good in single precision."""
@@ -50,4 +56,6 @@ class GraduatedNonConvexity(AbstractSearch):
         pose = in_single(self.start(pair).pose)
         pose = lax.fori_loop(0, self.absolute, absolute, pose)
         pose = lax.fori_loop(0, self.graded, graded, pose)
-        return jax.tree.map(lambda a: a.astype(pair.focal_left.dtype), pose).normalised()
+        return jax.tree.map(
+            lambda a: a.astype(pair.focal_left.dtype), pose
+        ).normalised()

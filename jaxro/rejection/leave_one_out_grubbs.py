@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from .. import critical_values
+from ..adjustment import critical_values
 from ..adjustment.normal_equations import accumulate, cholesky, substitute
-from ..elements import AbstractElements
-from ..orientation import orient
-from ..pairs import Pair, cleaned
-from ..programs import stage
-from ..reductions import count, sums, total
-from ..simulation import noisy, planted
+from ..geometry.elements import AbstractElements
+from ..geometry.mock_pairs import noisy, planted
+from ..geometry.pairs import Pair, cleaned
+from ..orientation.orient import orient
+from ..xla.programs import stage
+from ..xla.reductions import count, sums, total
 from .base import (
     AbstractProcedure,
     PointValues,
@@ -33,20 +33,29 @@ from .base import (
 )
 
 UNTESTABLE = 1e-3
-"""Redundancy number below which the omission of a point leaves a (nearly) singular system: the refits then do not
-converge in two iterations, and one such row would hide all others."""
+"""Redundancy number below which the omission of a point leaves a (nearly) singular
+system: the refits then do not converge in two iterations, and one such row would hide
+all others."""
 
 ROUNDING = 1e-10
-"""Differences of means (of the unit of the coordinates, or relative to them) that say nothing."""
+"""Differences of means (of the unit of the coordinates, or relative to them) that say
+nothing."""
 
 Means = tuple[Float[Array, "point"], Bool[Array, "point"]]
 
 
-def refitted(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements, iterations: int = 2) -> Means:
-    """Mean |q| after the omission of each point in turn (matrix 5 and means 6 of 1989), and whether it can be omitted.
+def refitted(
+    pair: Pair,
+    mask: Bool[Array, "point"],
+    elements: AbstractElements,
+    iterations: int = 2,
+) -> Means:
+    """Mean |q| after the omission of each point in turn (matrix 5 and means 6 of 1989),
+    and whether it can be omitted.
 
-    All omissions at once, each solved by some iterations from the solution of all points, of which every one squares
-    the error: two leave 1e-6 mm where an error is 2 mm, and rounding where it is .2 mm.
+    All omissions at once, each solved by some iterations from the solution of all
+    points, of which every one squares the error: two leave 1e-6 mm where an error is 2
+    mm, and rounding where it is .2 mm.
     """
     out = jnp.eye(mask.shape[0], dtype=bool)
 
@@ -55,16 +64,22 @@ def refitted(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements,
         solved = elements
         for _ in range(iterations):
             solved = iterated(pair, use, solved)
-        return total(jnp.abs(parallaxes(pair, use, solved))) / jnp.maximum(count(mask), 1.0)
+        return total(jnp.abs(parallaxes(pair, use, solved))) / jnp.maximum(
+            count(mask), 1.0
+        )
 
     _, _, redundancy = linearised(pair, mask, elements)
     return jax.vmap(one)(out), mask & (redundancy > UNTESTABLE)
 
 
-def closed_form(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements) -> Means:
-    """The same to first order: the omission of i changes q_j by h_ji q_i / r_i, H = A (AᵀA)⁻¹ Aᵀ, r_i = 1 - h_ii.
+def closed_form(
+    pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements
+) -> Means:
+    """The same to first order: the omission of i changes q_j by h_ji q_i / r_i, H = A
+    (AᵀA)⁻¹ Aᵀ, r_i = 1 - h_ii.
 
-    It differs from `refitted` where a point has much leverage or the elements change by much.
+    It differs from `refitted` where a point has much leverage or the elements change by
+    much.
     """
 
     def shared(pair, mask, elements):
@@ -77,7 +92,8 @@ def closed_form(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElemen
 
     def one(own, *change):
         moved = q + sum(column * c for column, c in zip(a, change, strict=True))
-        # Σ |moved| as two sums in one pass: a single one XLA computes after all n² numbers have been written
+        # Σ |moved| as two sums in one pass: a single one XLA computes after all n²
+        # numbers have been written
         above, below = sums((jnp.maximum(moved, 0.0), jnp.maximum(-moved, 0.0)))
         # a point not in use has q = a = 0
         return (above + below - own) / jnp.maximum(count(mask), 1.0)
@@ -87,8 +103,11 @@ def closed_form(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElemen
 
 
 def linearised(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements):
-    """q, (the columns a of A, those of (AᵀA)⁻¹ Aᵀ) and the redundancy numbers 1 - h_ii."""
-    (q,), jacobian, weight = residuals_at(pair, mask, elements).columns((jnp.zeros_like(pair.focal_left),) * 5)
+    """q, (the columns a of A, those of (AᵀA)⁻¹ Aᵀ) and the redundancy numbers 1 -
+    h_ii."""
+    (q,), jacobian, weight = residuals_at(pair, mask, elements).columns(
+        (jnp.zeros_like(pair.focal_left),) * 5
+    )
     n, _, _ = accumulate([q], jacobian, weight)
     a = [jnp.where(mask, column, 0.0) for (column,) in jacobian]
     z = substitute(cholesky(n)[0], a)
@@ -96,7 +115,9 @@ def linearised(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElement
     return jnp.where(mask, q, 0.0), (a, z), jnp.where(mask, 1 - h, 0.0)
 
 
-def grubbs_statistic(means: Float[Array, "point"], use: Bool[Array, "point"]) -> PointValues:
+def grubbs_statistic(
+    means: Float[Array, "point"], use: Bool[Array, "point"]
+) -> PointValues:
     """V of every omission: (mean of the means - its mean) / S, eqs (7) to (9)."""
     centre = mean_of(means, use)
     spread = jnp.sqrt(mean_of((means - centre) ** 2, use))
@@ -106,12 +127,14 @@ def grubbs_statistic(means: Float[Array, "point"], use: Bool[Array, "point"]) ->
 
 
 class LeaveOneOutGrubbs(AbstractProcedure):
-    """Omit each point in turn; the omission with the smallest mean |q| is wrong if its V exceeds the critical value.
+    """Omit each point in turn; the omission with the smallest mean |q| is wrong if its
+    V exceeds the critical value.
 
-    One point a round, until none is rejected or `least` are left. `exact`: refits, or the closed form. `critical`: by
-    number of points in use, from `calibrated`; otherwise Grubbs' formula at `level`, which takes the means for a
-    normal sample. They are none: at 5 % it rejects a point of nearly half of all pairs without an error.
-    An omission that leaves a singular system is not testable and never judged.
+    One point a round, until none is rejected or `least` are left. `exact`: refits, or
+    the closed form. `critical`: by number of points in use, from `calibrated`;
+    otherwise Grubbs' formula at `level`, which takes the means for a normal sample.
+    They are none: at 5 % it rejects a point of nearly half of all pairs without an
+    error. An omission that leaves a singular system is not testable and never judged.
     """
 
     level: float = 0.05
@@ -129,18 +152,29 @@ class LeaveOneOutGrubbs(AbstractProcedure):
             out = largest(v, testable) & (v > limit) & (count(mask) > self.least)
             return Round(v, limit, out, solved.parallax, values(solved.elements))
 
-        history = repeated(judge, began(pair, max(pair.x_left.shape[0] - self.least, 0) + 1))
+        history = repeated(
+            judge, began(pair, max(pair.x_left.shape[0] - self.least, 0) + 1)
+        )
         return ended(history, by_parallax(pair, history.mask), finished(pair))
 
-    def statistic(self, pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements) -> tuple:
+    def statistic(
+        self, pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements
+    ) -> tuple:
         """V of every point in use, and which can be tested."""
-        means, testable = (refitted if self.exact else closed_form)(pair, mask, elements)
+        means, testable = (refitted if self.exact else closed_form)(
+            pair, mask, elements
+        )
         return grubbs_statistic(means, testable), testable
 
-    def limit(self, pair: Pair, mask: Bool[Array, "point"], testable: Bool[Array, "point"]) -> Float[Array, ""]:
-        """The critical value for so many points in use, of which so many can be tested."""
+    def limit(
+        self, pair: Pair, mask: Bool[Array, "point"], testable: Bool[Array, "point"]
+    ) -> Float[Array, ""]:
+        """The critical value for so many points in use, of which so many can be
+        tested."""
         formula = critical_values.by_count(
-            lambda n: critical_values.grubbs(self.level, n), pair.x_left.shape[0], count(testable)
+            lambda n: critical_values.grubbs(self.level, n),
+            pair.x_left.shape[0],
+            count(testable),
         )
         if self.critical is None:
             return formula
@@ -150,30 +184,52 @@ class LeaveOneOutGrubbs(AbstractProcedure):
 
 
 def calibrated(
-    procedure: LeaveOneOutGrubbs, pair: Pair, key: PRNGKeyArray, trials: int = 4000, rounds: int = 10
+    procedure: LeaveOneOutGrubbs,
+    pair: Pair,
+    key: PRNGKeyArray,
+    trials: int = 4000,
+    rounds: int = 10,
 ) -> LeaveOneOutGrubbs:
-    """The procedure with critical values from the distribution of the largest V on the layout of this pair.
+    """The procedure with critical values from the distribution of the largest V on the
+    layout of this pair.
 
-    Errors of equal variance are added to the adjusted points of the pair; V does not depend on their size. For the
-    rounds after a rejection as many random points are left out. Numbers of points beyond `rounds` use the formula.
+    Errors of equal variance are added to the adjusted points of the pair; V does not
+    depend on their size. For the rounds after a rejection as many random points are
+    left out. Numbers of points beyond `rounds` use the formula.
     """
     pair = cleaned(pair)[0]
     solved = orient(pair)
     x_left, y_left, x_right, y_right = solved.corrections(pair)
-    exact = planted(pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right)
+    exact = planted(
+        pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right
+    )
     size = 1e-5 * pair.focal_left
     used = int(count(pair.mask))
     table = jnp.zeros(pair.x_left.shape[0] + 1)
 
     def one(key, omitted):
         noise, choice = jax.random.split(key)
-        rank = jnp.argsort(jnp.argsort(jnp.where(pair.mask, jax.random.uniform(choice, pair.mask.shape, float), 2.0)))
+        rank = jnp.argsort(
+            jnp.argsort(
+                jnp.where(
+                    pair.mask, jax.random.uniform(choice, pair.mask.shape, float), 2.0
+                )
+            )
+        )
         measured = noisy(exact, noise, size)
         mask = pair.mask & (rank >= omitted)
-        return jnp.max(procedure.statistic(measured, mask, by_parallax(measured, mask, solved.pose).pose)[0])
+        return jnp.max(
+            procedure.statistic(
+                measured, mask, by_parallax(measured, mask, solved.pose).pose
+            )[0]
+        )
 
     run = jax.jit(jax.vmap(one, (0, None)))
     for omitted in range(min(rounds, max(used - procedure.least, 0)) + 1):
-        largest_v = run(jax.random.split(jax.random.fold_in(key, omitted), trials), omitted)
-        table = table.at[used - omitted].set(jnp.quantile(largest_v, 1 - procedure.level))
+        largest_v = run(
+            jax.random.split(jax.random.fold_in(key, omitted), trials), omitted
+        )
+        table = table.at[used - omitted].set(
+            jnp.quantile(largest_v, 1 - procedure.level)
+        )
     return dataclasses.replace(procedure, critical=table)

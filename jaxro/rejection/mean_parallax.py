@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from ..pairs import Pair, cleaned
+from ..geometry.pairs import Pair, cleaned
 from .base import (
     OUTCOMES,
     AbstractProcedure,
@@ -20,9 +20,11 @@ from .base import (
 
 
 class MeanParallax(AbstractProcedure):
-    """Reject, once, every point with |q| - mean |q| >= eps (Dorozhinsky 1971, eqs 1 and 3), after convergence.
+    """Reject, once, every point with |q| - mean |q| >= eps (Dorozhinsky 1971, eqs 1 and
+    3), after convergence.
 
-    Applies to more than `more_than` points and leaves at least `least`, the points of largest |q| going first.
+    Applies to more than `more_than` points and leaves at least `least`, the points of
+    largest |q| going first.
     """
 
     eps: float = 0.01
@@ -37,7 +39,9 @@ class MeanParallax(AbstractProcedure):
         enough = pair.count > self.more_than
         bad = pair.mask & (excess >= self.eps) & enough
         bad = at_most(bad, q, pair.mask, self.least)
-        new = Round(excess, jnp.asarray(self.eps), bad, first.parallax, values(first.elements))
+        new = Round(
+            excess, jnp.asarray(self.eps), bad, first.parallax, values(first.elements)
+        )
         history = recorded(began(pair, 1), new)
         outcome = OUTCOMES.where(enough, finished(pair), OUTCOMES.nothing_to_test)
         return ended(history, by_parallax(pair, history.mask, first.elements), outcome)

@@ -1,4 +1,5 @@
-"""Iteratively reweighted least squares with the weight functions of robust statistics and geodesy."""
+"""Iteratively reweighted least squares with the weight functions of robust statistics
+and geodesy."""
 
 import jax
 import jax.numpy as jnp
@@ -6,22 +7,23 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment.losses import AbstractWeight, Huber, Tukey
-from ..conditions import linearised
-from ..elements import RelativePose
-from ..pairs import Pair, cleaned
-from ..programs import while_loop
-from ..reductions import count
-from ..starts import AbstractStart, Vertical
+from ..geometry.elements import RelativePose
+from ..geometry.linear import linearised
+from ..geometry.pairs import Pair, cleaned
+from ..orientation.starts import AbstractStart, Vertical
+from ..xla.programs import while_loop
+from ..xla.reductions import count
 from .base import OUTCOMES, Rejection
 from .robust import AbstractSearch, Values, judged, normalised, scaled, stepped
 
 PLAIN, CONVEX, FULL = 2, 5, 15
-"""Steps of least squares, steps with Huber's weights, steps with those of the function itself; what follows uses the
-mean of new and last weights.
+"""Steps of least squares, steps with Huber's weights, steps with those of the function
+itself; what follows uses the mean of new and last weights.
 
-A function that lets go of a point has many local optima, and large errors spoil that next to least squares: of 1,000
-pairs of 16 points with up to three errors of 4 to 1,000 sigma Tukey's function alone cleans 57 % perfectly, after
-Huber's 87 %. It can also take a point up and let it go for ever: 10 % of these pairs, with the means none.
+A function that lets go of a point has many local optima, and large errors spoil that
+next to least squares: of 1,000 pairs of 16 points with up to three errors of 4 to 1,000
+sigma Tukey's function alone cleans 57 % perfectly, after Huber's 87 %. It can also take
+a point up and let it go for ever: 10 % of these pairs, with the means none.
 """
 
 HOLDS = 1e-6
@@ -29,13 +31,15 @@ HOLDS = 1e-6
 
 
 class Reweighting(AbstractSearch):
-    """Least squares with the weights `function`(w²), w the standardised residuals, until the pose rests; |w| > `limit`
-    goes.
+    """Least squares with the weights `function`(w²), w the standardised residuals,
+    until the pose rests; |w| > `limit` goes.
 
-    Standardised, not plain residuals are weighed, since a point of large leverage draws the solution to itself. Least
-    squares and a few steps with Huber's weights come first, since a function that lets go of a point needs a start
-    that is robust already. Ends when no local parameter moves by more than `tolerance` (rad), or after `rounds`:
-    outcome `did_not_rest`. `limit`: root of the chi-squared value of one degree of freedom at .001.
+    Standardised, not plain residuals are weighed, since a point of large leverage draws
+    the solution to itself. Least squares and a few steps with Huber's weights come
+    first, since a function that lets go of a point needs a start that is robust
+    already. Ends when no local parameter moves by more than `tolerance` (rad), or after
+    `rounds`: outcome `did_not_rest`. `limit`: root of the chi-squared value of one
+    degree of freedom at .001.
     """
 
     function: AbstractWeight = Tukey()
@@ -50,7 +54,9 @@ class Reweighting(AbstractSearch):
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         rests, pose, share = self._solved(fixed)
         w = normalised(linearised(fixed, pose), share)
-        return judged(pair, pose, pair.mask & (w <= self.limit), self.limit, w).only_if(rests, OUTCOMES.did_not_rest)
+        return judged(pair, pose, pair.mask & (w <= self.limit), self.limit, w).only_if(
+            rests, OUTCOMES.did_not_rest
+        )
 
     def search(self, pair: Pair) -> RelativePose:
         return self._solved(pair)[1]
@@ -61,13 +67,19 @@ class Reweighting(AbstractSearch):
 
         def more(state):
             rounds, moved, *_ = state
-            return (rounds < self.rounds) & ((moved > self.tolerance) | (rounds <= PLAIN + CONVEX))
+            return (rounds < self.rounds) & (
+                (moved > self.tolerance) | (rounds <= PLAIN + CONVEX)
+            )
 
         def turn(state):
             rounds, _, pose, share = state
             linear = linearised(pair, pose)
             w = normalised(linear, share)
-            new = jnp.where(rounds < PLAIN + CONVEX, Huber().weight(w * w), self.function.weight(w * w))
+            new = jnp.where(
+                rounds < PLAIN + CONVEX,
+                Huber().weight(w * w),
+                self.function.weight(w * w),
+            )
             new = jnp.where(rounds < PLAIN + CONVEX + FULL, new, (share + new) / 2)
             share = jnp.where(rounds < PLAIN, share, jnp.where(pair.mask, new, 0.0))
             after = stepped(pose, linear, linear.weight * share)
@@ -82,7 +94,8 @@ class Reweighting(AbstractSearch):
 
 
 def _distance(one: RelativePose, other: RelativePose) -> Float[Array, ""]:
-    """The largest difference of a component of quaternion or base, which is at least half the angle between them."""
+    """The largest difference of a component of quaternion or base, which is at least
+    half the angle between them."""
     worst = one.qw * 0
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         worst = jnp.maximum(worst, jnp.abs(a - b))

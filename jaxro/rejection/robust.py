@@ -1,4 +1,5 @@
-"""Steps of reweighted Gauss-Newton on the distances of the points, and the set of points that agree with a pose."""
+"""Steps of reweighted Gauss-Newton on the distances of the points, and the set of
+points that agree with a pose."""
 
 import abc
 from collections.abc import Callable
@@ -8,21 +9,32 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .. import coplanarity, rotations as rot
 from ..adjustment.normal_equations import accumulate, cholesky, solve, substitute
-from ..conditions import Linear, linearised
-from ..elements import RelativePose
-from ..orientation import orient
-from ..pairs import Pair
-from ..programs import while_loop
-from ..reductions import count, total
-from .base import OUTCOMES, AbstractProcedure, Rejection, Round, began, ended, finished, independent, recorded
+from ..geometry import coplanarity, rotations as rot
+from ..geometry.elements import RelativePose
+from ..geometry.linear import Linear, linearised
+from ..geometry.pairs import Pair
+from ..orientation.orient import orient
+from ..xla.programs import while_loop
+from ..xla.reductions import count, total
+from .base import (
+    OUTCOMES,
+    AbstractProcedure,
+    Rejection,
+    Round,
+    began,
+    ended,
+    finished,
+    independent,
+    recorded,
+)
 
 Values = Float[Array, "point"]
 Use = Bool[Array, "point"]
 
 LEAST = 0.01
-"""Smallest redundancy of a point when sets are compared: below it a point would be rejected for that alone."""
+"""Smallest redundancy of a point when sets are compared: below it a point would be
+rejected for that alone."""
 
 
 class AbstractSearch(AbstractProcedure):
@@ -33,10 +45,13 @@ class AbstractSearch(AbstractProcedure):
         """A pose near the right one, in spite of the wrong points."""
 
 
-def judged(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, w: Values | None = None) -> Rejection:
-    """The verdict that only `use` are right, with the orientation of them and the evidence |w| against the limit: that
-    by which it was decided, or else that of this orientation; infinite where a point was rejected as it cannot be seen.
-    Of five points and fewer none can be tested."""
+def judged(
+    pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, w: Values | None = None
+) -> Rejection:
+    """The verdict that only `use` are right, with the orientation of them and the
+    evidence |w| against the limit: that by which it was decided, or else that of this
+    orientation; infinite where a point was rejected as it cannot be seen. Of five
+    points and fewer none can be tested."""
     enough = count(pair.mask) > 5
     use = jnp.where(enough, use, pair.mask)
     solved = orient(pair.with_mask(use), start=pose)
@@ -52,7 +67,10 @@ def judged(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, w: Values
 
 def in_single(tree: PyTree) -> PyTree:
     """The tree with its floating-point numbers in single precision."""
-    return jax.tree.map(lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, tree)
+    return jax.tree.map(
+        lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a,
+        tree,
+    )
 
 
 def scaled(pair: Pair, sigma: float | None) -> Pair:
@@ -63,31 +81,40 @@ def scaled(pair: Pair, sigma: float | None) -> Pair:
     return Pair(*pair.coordinates, known, pair.mask, pair.focal_left, pair.focal_right)
 
 
-def stepped(pose: RelativePose, linear: Linear, weight: Values, most: float = 0.3) -> RelativePose:
-    """The pose after one Gauss-Newton step with these weights in place of those of `linear`, no component longer than
-    `most` (rad)."""
+def stepped(
+    pose: RelativePose, linear: Linear, weight: Values, most: float = 0.3
+) -> RelativePose:
+    """The pose after one Gauss-Newton step with these weights in place of those of
+    `linear`, no component longer than `most` (rad)."""
     n, h, _ = accumulate([linear.g], [[c] for c in linear.columns], [weight])
     delta = solve(n, h)
     longest = delta[0] * 0
     for d in delta:
         longest = jnp.maximum(longest, jnp.abs(d))
-    shrink = jnp.minimum(1.0, most / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny))
+    shrink = jnp.minimum(
+        1.0, most / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny)
+    )
     shrink = jnp.where(jnp.isfinite(longest), shrink, 0.0)
-    moved = pose.moved(tuple(jnp.where(jnp.isfinite(d), -shrink * d, 0.0) for d in delta))
+    moved = pose.moved(
+        tuple(jnp.where(jnp.isfinite(d), -shrink * d, 0.0) for d in delta)
+    )
     return moved.normalised()
 
 
-def reweighted(pair: Pair, pose: RelativePose, weight: Callable[[Values], Values]) -> RelativePose:
+def reweighted(
+    pair: Pair, pose: RelativePose, weight: Callable[[Values], Values]
+) -> RelativePose:
     """One step with the weights `weight`((r / sigma)²)."""
     linear = linearised(pair, pose)
     return stepped(pose, linear, linear.weight * weight(linear.squares))
 
 
 def normalised(linear: Linear, share: Use | Values) -> Values:
-    """|w| of all points against the solution of those in use, or of all with a `share` of their weights.
+    """|w| of all points against the solution of those in use, or of all with a `share`
+    of their weights.
 
-    A point in use has the variance 1 - h, h = a N⁻¹ aᵀ its leverage; one not in use has 1 + h;
-    in between it is 1 + (1 - 2p) h.
+    A point in use has the variance 1 - h, h = a N⁻¹ aᵀ its leverage; one not in use has
+    1 + h; in between it is 1 + (1 - 2p) h.
     """
     return jnp.sqrt(linear.squares / _controlled(linear, share)[0])
 
@@ -95,21 +122,28 @@ def normalised(linear: Linear, share: Use | Values) -> Values:
 def _controlled(linear: Linear, share: Use | Values) -> tuple[Values, Float[Array, ""]]:
     """The variance of each r / sigma, and log det N."""
     share = share.astype(linear.weight.dtype)
-    n, _, _ = accumulate([linear.g], [[c] for c in linear.columns], [linear.weight * share])
+    n, _, _ = accumulate(
+        [linear.g], [[c] for c in linear.columns], [linear.weight * share]
+    )
     factor, _ = cholesky(n)
     z = substitute(factor, linear.columns)
     h = linear.weight * sum(a * b for a, b in zip(linear.columns, z, strict=True))
     h = jnp.where(jnp.isfinite(h), h, 1.0)
     inverse_pivots = [row[i] for i, row in enumerate(factor)]
-    return jnp.maximum(1 + (1 - 2 * share) * h, 1e-6), -2 * sum(map(jnp.log, inverse_pivots))  # pyright: ignore[reportReturnType]
+    return jnp.maximum(1 + (1 - 2 * share) * h, 1e-6), -2 * sum(
+        map(jnp.log, inverse_pivots)
+    )  # pyright: ignore[reportReturnType]
 
 
 def in_front(pair: Pair, pose: RelativePose) -> Use:
-    """The points in front of both photos, with the sign of the base that most of them ask for."""
+    """The points in front of both photos, with the sign of the base that most of them
+    ask for."""
     rotation, base = pose.relative()
 
     def depths(point):
-        return coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)[3:]
+        return coplanarity.rays(
+            None, rotation, base, point, pair.focal_left, pair.focal_right
+        )[3:]
 
     lam, mu = jax.vmap(depths)(pair.coordinates)
     front, behind = pair.mask & (lam > 0) & (mu > 0), pair.mask & (lam < 0) & (mu < 0)
@@ -117,25 +151,34 @@ def in_front(pair: Pair, pose: RelativePose) -> Use:
 
 
 def parallel(pair: Pair, pose: RelativePose, limit: ArrayLike) -> Use:
-    """The points whose rays are parallel within `limit` standard deviations of the angle between them."""
+    """The points whose rays are parallel within `limit` standard deviations of the
+    angle between them."""
     rotation, base = pose.relative()
 
     def one(point, sigma):
-        first, second, w2, *_ = coplanarity.rays(None, rotation, base, point, pair.focal_left, pair.focal_right)
+        first, second, w2, *_ = coplanarity.rays(
+            None, rotation, base, point, pair.focal_left, pair.focal_right
+        )
         variance = sigma**2 * (1 / rot.dot(first, first) + 1 / rot.dot(second, second))
-        return w2 <= jnp.asarray(limit, w2.dtype) ** 2 * variance * rot.dot(first, first) * rot.dot(second, second)
+        return w2 <= jnp.asarray(limit, w2.dtype) ** 2 * variance * rot.dot(
+            first, first
+        ) * rot.dot(second, second)
 
     return pair.mask & jax.vmap(one)(pair.coordinates, pair.sigma)
 
 
 def seen(pair: Pair, pose: RelativePose, limit: ArrayLike) -> Use:
-    """The points that can be seen: in front of both photos, or so far that the sign of their depth says nothing."""
+    """The points that can be seen: in front of both photos, or so far that the sign of
+    their depth says nothing."""
     return in_front(pair, pose) | parallel(pair, pose, limit)
 
 
 @partial(jax.jit, static_argnames="rounds")
-def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int) -> tuple[RelativePose, Use]:
-    """The pose of the points with |w| <= limit, found in turns: solve, judge every point anew.
+def agreeing(
+    pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int
+) -> tuple[RelativePose, Use]:
+    """The pose of the points with |w| <= limit, found in turns: solve, judge every
+    point anew.
 
     Ends when the points stay the same after two turns or more, at last after `rounds`.
     """
@@ -152,26 +195,39 @@ def agreeing(pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds:
 
 @partial(jax.jit, static_argnames="rounds")
 def one_by_one(
-    pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, rounds: int, wanted: Bool[Array, ""] | bool = True
+    pair: Pair,
+    pose: RelativePose,
+    use: Use,
+    limit: ArrayLike,
+    rounds: int,
+    wanted: Bool[Array, ""] | bool = True,
 ):
-    """(pose, points) near the least cost, the cost (before the last change, if it does not rest), and whether it rests.
+    """(pose, points) near the least cost, the cost (before the last change, if it does
+    not rest), and whether it rests.
 
-    The cost is Σ (r/sigma)² over the points in use + limit² (points rejected) + log det N of those in use, minus twice
-    the logarithm of the evidence for that set by Laplace's approximation (MacKay 1992): a wrong point agrees by
-    accident the more easily the less the others say about where it should be. In each round the one point changes
-    sides that lowers the cost most: out, by w² - limit² - log(1 - h), or in, by limit² - w² - log(1 + h). The limit is
-    widened by what this takes from it on the average of n points all in use, log(n / (n - 5)).
-    Nothing happens, and nothing rests, where it is not `wanted`.
+    The cost is Σ (r/sigma)² over the points in use + limit² (points rejected) + log det
+    N of those in use, minus twice the logarithm of the evidence for that set by
+    Laplace's approximation (MacKay 1992): a wrong point agrees by accident the more
+    easily the less the others say about where it should be. In each round the one point
+    changes sides that lowers the cost most: out, by w² - limit² - log(1 - h), or in, by
+    limit² - w² - log(1 + h). The limit is widened by what this takes from it on the
+    average of n points all in use, log(n / (n - 5)). Nothing happens, and nothing
+    rests, where it is not `wanted`.
     """
     n, wanted = count(pair.mask), jnp.asarray(wanted)
-    cut = jnp.asarray(limit, pair.sigma.dtype) ** 2 + jnp.log(jnp.maximum(n, 6.0) / jnp.maximum(n - 5, 1.0))
+    cut = jnp.asarray(limit, pair.sigma.dtype) ** 2 + jnp.log(
+        jnp.maximum(n, 6.0) / jnp.maximum(n - 5, 1.0)
+    )
 
     def turn(state):
         k, _, pose, use, _ = state
         pose = improved(pair, pose, use)
         linear = linearised(pair, pose)
         variance, log_det = _controlled(linear, use)
-        cost = total(jnp.where(pair.mask, jnp.where(use, linear.squares, cut), 0.0)) + log_det
+        cost = (
+            total(jnp.where(pair.mask, jnp.where(use, linear.squares, cut), 0.0))
+            + log_det
+        )
         over = linear.squares / variance - cut
         gain = jnp.where(use, over, -over) - jnp.log(jnp.maximum(variance, LEAST))
         gain = jnp.where(pair.mask, gain, 0.0)
@@ -179,7 +235,9 @@ def one_by_one(
         cost = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
         return k + 1, best > 0, pose, use ^ ((gain == best) & (best > 0)), cost
 
-    going, pose, use, cost = _while_needed(rounds, wanted, turn, pair, pose, use, cut + jnp.inf)
+    going, pose, use, cost = _while_needed(
+        rounds, wanted, turn, pair, pose, use, cut + jnp.inf
+    )
     return (pose, use), cost, wanted & ~going
 
 
@@ -189,7 +247,12 @@ def improved(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
     return stepped(pose, linear, jnp.where(use, linear.weight, 0.0))
 
 
-def _while_needed(rounds: int, needed: Bool[Array, ""], turn: Callable, pair: Pair, *state: PyTree):
-    """(needed, *state) after turns (k, needed, *state) -> the same, while needed and at most `rounds`."""
+def _while_needed(
+    rounds: int, needed: Bool[Array, ""], turn: Callable, pair: Pair, *state: PyTree
+):
+    """(needed, *state) after turns (k, needed, *state) -> the same, while needed and at
+    most `rounds`."""
     start = (jnp.zeros((), int), needed, *state)
-    return while_loop(lambda state: state[1] & (state[0] < rounds), turn, start, pair.focal_left)[1:]
+    return while_loop(
+        lambda state: state[1] & (state[0] < rounds), turn, start, pair.focal_left
+    )[1:]

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from ..pairs import Pair, cleaned
+from ..geometry.pairs import Pair, cleaned
 from .base import (
     OUTCOMES,
     AbstractProcedure,
@@ -19,9 +19,11 @@ from .base import (
 
 
 class ThreeSigma(AbstractProcedure):
-    """Reject, once, every point with |q| >= factor m_q, m_q = sqrt([qq]/(n-5)) (Dorozhinsky 1971, eqs 2 and 4).
+    """Reject, once, every point with |q| >= factor m_q, m_q = sqrt([qq]/(n-5))
+    (Dorozhinsky 1971, eqs 2 and 4).
 
-    Applies to more than `more_than` points and leaves at least `least`, the points of largest |q| going first.
+    Applies to more than `more_than` points and leaves at least `least`, the points of
+    largest |q| going first.
     """
 
     factor: float = 3.0
@@ -36,6 +38,8 @@ class ThreeSigma(AbstractProcedure):
         enough = pair.count > self.more_than
         bad = pair.mask & (q >= limit) & (q > 1e-12 * pair.focal_left) & enough
         bad = at_most(bad, q, pair.mask, self.least)
-        history = recorded(began(pair, 1), Round(q, limit, bad, first.parallax, values(first.elements)))
+        history = recorded(
+            began(pair, 1), Round(q, limit, bad, first.parallax, values(first.elements))
+        )
         outcome = OUTCOMES.where(enough, finished(pair), OUTCOMES.nothing_to_test)
         return ended(history, by_parallax(pair, history.mask, first.elements), outcome)

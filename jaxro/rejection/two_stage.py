@@ -2,17 +2,19 @@
 
 import jax.numpy as jnp
 
-from ..pairs import Pair
+from ..geometry.pairs import Pair
 from .base import OUTCOMES, AbstractProcedure, Log, Rejection
 from .dorozhinsky import Dorozhinsky
 from .leave_one_out_grubbs import LeaveOneOutGrubbs
 
 
 class TwoStage(AbstractProcedure):
-    """Residual parallaxes first, Grubbs on the points left: the two stages of table 2 of 1989.
+    """Residual parallaxes first, Grubbs on the points left: the two stages of table 2
+    of 1989.
 
-    Its residual-parallax stage (eqs 2 to 4) is the algorithm of 1971. Any two procedures can be chained. A pair on
-    which the first needs an operator is still given to the second, and keeps that outcome.
+    Its residual-parallax stage (eqs 2 to 4) is the algorithm of 1971. Any two
+    procedures can be chained. A pair on which the first needs an operator is still
+    given to the second, and keeps that outcome.
     """
 
     first: AbstractProcedure = Dorozhinsky()
@@ -22,7 +24,12 @@ class TwoStage(AbstractProcedure):
         one = self.first(pair)
         two = self.second(pair.with_mask(one.mask))
         later = two.order > 0
-        log = Log(*(jnp.concatenate([a, b]) for a, b in zip(_parts(one.log), _parts(two.log), strict=True)))
+        log = Log(
+            *(
+                jnp.concatenate([a, b])
+                for a, b in zip(_parts(one.log), _parts(two.log), strict=True)
+            )
+        )
         unfinished = one.outcome == OUTCOMES.operator_needed
         return Rejection(
             mask=two.mask,
@@ -36,4 +43,11 @@ class TwoStage(AbstractProcedure):
 
 
 def _parts(log: Log) -> tuple:
-    return log.happened, log.statistic, log.limit, log.rejected, log.parallax, log.elements
+    return (
+        log.happened,
+        log.statistic,
+        log.limit,
+        log.rejected,
+        log.parallax,
+        log.elements,
+    )

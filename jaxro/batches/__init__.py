@@ -1,0 +1,1 @@
+"""Many pairs of every length at once."""

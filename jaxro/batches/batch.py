@@ -1,0 +1,368 @@
+"""Many pairs at once, on every core.
+
+Pairs go through in slabs of fixed size, a slab in chunks that stay in the cache
+(`lax.map` over `vmap`), slabs spread over threads, and over the devices where there are
+several: XLA releases the interpreter lock and runs a chunk on one core, and nothing in
+the program calls LAPACK, which would deadlock. Pairs that do not start from the
+vertical are collected and oriented in a second, smaller pass, so that they do not hold
+up their chunk.
+"""
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from ..geometry.elements import AbstractElements
+from ..geometry.pairs import Pair, double
+from ..orientation.orient import DEFAULTS, Orientation, orient, orient_near
+from ..orientation.starts import AbstractStart, Auto
+from ..rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
+from ..rejection.hypotheses import AbstractHypotheses
+from ..rejection.search import Search
+from ..xla.programs import (
+    FAST,
+    QUICK,
+    QUICKEST,
+    UNDIVIDED,
+    WIDE,
+    Program,
+    whole,
+    whole_of_many,
+)
+from ..xla.slabs import Report, Way, chunked, spread, unheard
+
+CHUNK_POINTS = 16384
+"""Points per chunk: a working set of a few hundred kB, which stays in the cache of one
+core."""
+
+SUBSETS = 256
+"""Random subsets that are solved together."""
+
+ALONE = 1 << 15
+"""Points of a batch that are oriented from the vertical before other threads have
+begun."""
+
+MOMENT, SOON = 1 << 9, 1 << 17
+"""Points of a batch up to which a program runs for milliseconds and, that of a general
+start or a procedure, seconds: these compile in 11 and 12 instead of 18 seconds and run
+a fourteenth slower."""
+
+FEW = 32
+"""Points up to which wider vectors gain (3 to 10 %) in what is not one kernel; with
+more they lose."""
+
+
+def _everything(result: Any) -> Any:
+    return result
+
+
+class Selected(NamedTuple):
+    """What is kept of (pair, orientation) where the pair does not matter."""
+
+    select: Callable[[Orientation], PyTree]
+
+    def __call__(self, pair: Pair, orientation: Orientation) -> PyTree:
+        """What is kept."""
+        return self.select(orientation)
+
+
+def orient_batch(
+    pairs: Pair,
+    *,
+    select: Callable[[Orientation], PyTree] = _everything,
+    read: Callable[[Pair, Orientation], PyTree] | None = None,
+    progress: Report | None = None,
+    threads: int | None = None,
+    chunk: int | None = None,
+    start: AbstractStart | Any = Auto(),  # noqa: B008 (frozen)
+    **options,
+) -> PyTree:
+    """`orient` of every pair of a batch (pairs on the leading axis), on all cores.
+
+    `select` picks what to keep of each orientation, and XLA computes nothing else:
+    `lambda o: o.pose` is a bare solve. `read`, in its place, makes of a pair and its
+    orientation whatever is wanted, in the same compiled program: `lambda pair, o:
+    assess(pair, o, sigma0=0.01)`. A function object is compiled once. `progress(done,
+    total)` is called from the calling thread. `threads` (all cores) and `chunk`, pairs
+    that are worked on together, are chosen if not given. Other keywords are those of
+    `orient`. The results are those of `orient` one by one, to rounding. Up to 512 MB of
+    results that nobody holds any more are kept as memory for the next ones.
+    """
+    if read is not None and select is not _everything:
+        raise ValueError(
+            "select and read exclude each other; read sees the orientation, too"
+        )
+    host, report, way = (
+        jax.tree.map(np.asarray, double(pairs)),
+        progress or unheard,
+        Way(threads, chunk),
+    )
+    options = settled(options | {"start": start}) | {
+        "read": Selected(select) if read is None else read
+    }
+    if not isinstance(start, Auto):
+        return _finish(oriented(host, options, way, report))
+    out, fits = oriented_near(host, options, way, report)
+    rest = np.flatnonzero(~fits)
+    if rest.size:
+        left_over = jax.tree.map(lambda a: a[rest], host)
+        again = oriented(
+            left_over, options | {"start": start.general}, Way(threads, chunk), unheard
+        )
+        out = _replaced(out, rest, again)
+    return _finish(out)
+
+
+def settled(options: dict[str, Any]) -> dict[str, Any]:
+    """The options of `orient`, a given base as an array: an argument, no program for
+    each value. Raises TypeError for what is none, ValueError for one of each pair."""
+    for name in set(options) - set(DEFAULTS):
+        raise TypeError(
+            f"there is no option {name!r}: orient takes {', '.join(DEFAULTS)}"
+        )
+    base, start = options.get("base"), options.get("start")
+    for name, given in (
+        ("base", base),
+        ("start", start if isinstance(start, AbstractElements) else None),
+    ):
+        if any(jnp.ndim(leaf) for leaf in jax.tree.leaves(given)):
+            raise ValueError(
+                f"`{name}` holds for all pairs of a batch; one of each pair goes with "
+                f"jax.jit(jax.vmap(lambda pair, {name}: orient(pair, "
+                f"{name}={name})))(pairs, {name})"
+            )
+    return options if base is None else options | {"base": jnp.asarray(base, float)}
+
+
+def oriented(
+    pairs: Pair,
+    options: dict[str, Any],
+    way: Way = Way(),  # noqa: B008 (frozen)
+    report: Report = unheard,
+) -> PyTree:
+    """read(pair, orientation) of every pair, in NumPy; `options`: read, start, and
+    those of `orient`."""
+    chunk = _chunk(pairs, way.chunk)
+    return spread(
+        pairs,
+        Program(_slab, options | {"chunk": chunk}, _settings(pairs)),
+        way,
+        chunk,
+        report,
+    )
+
+
+def oriented_near(
+    pairs: Pair,
+    options: dict[str, Any],
+    way: Way = Way(),  # noqa: B008 (frozen)
+    report: Report = unheard,
+) -> tuple[PyTree, np.ndarray]:
+    """The same from the vertical, and for which pairs that fits; `options["start"]` is
+    an `Auto`."""
+    chunk = _chunk(pairs, way.chunk)
+    alone = pairs.x_left.size <= ALONE
+    way = (
+        way._replace(threads=way.threads or 1, calls=0)
+        if alone
+        else way._replace(calls=1)
+    )  # all take as long
+    kernel, lasting = (
+        (whole, FAST | WIDE) if alone else (whole_of_many, FAST | WIDE | UNDIVIDED)
+    )
+    kernel = kernel if options.get("solver") is None else None
+    program = Program(
+        _slab_near, options | {"chunk": chunk}, _settings(pairs, lasting), kernel=kernel
+    )
+    return spread(pairs, program, way, chunk, report)
+
+
+def _replaced(out: PyTree, rows: np.ndarray, new: PyTree) -> PyTree:
+    """The arrays with these rows new; in place but for those that are the program's
+    own."""
+
+    def one(target: np.ndarray, source: np.ndarray) -> np.ndarray:
+        target = target if target.flags.writeable else target.copy()
+        target[rows] = source
+        return target
+
+    return jax.tree.map(one, out, new)
+
+
+def clean_batch(
+    pairs: Pair,
+    procedure: AbstractProcedure,
+    *,
+    select: Callable[[Rejection], PyTree] = _everything,
+    progress: Report | None = None,
+    threads: int | None = None,
+    chunk: int | None = None,
+) -> PyTree:
+    """`procedure` of every pair of a batch (pairs on the leading axis), on all cores;
+    keywords as of `orient_batch`.
+
+    `select=lambda r: r.mask` computes no log and no statistics that the decision does
+    not need.
+    """
+    host, report, way = (
+        jax.tree.map(np.asarray, double(pairs)),
+        progress or unheard,
+        Way(threads, chunk),
+    )
+    out = decided_in_stages(host, procedure, select, way, report)
+    return _finish(out)
+
+
+def stages(procedure: AbstractProcedure, points: int) -> Sequence[AbstractProcedure]:
+    """The procedures to be tried in turn on pairs of up to so many points, each on
+    those that the one before left in doubt."""
+    return (
+        procedure.separate(points)
+        if isinstance(procedure, Recommended)
+        else (procedure,)
+    )
+
+
+def decided_in_stages(
+    pairs: Pair,
+    procedure: AbstractProcedure,
+    select: Callable[[Rejection], PyTree],
+    way: Way,
+    report: Report,
+) -> PyTree:
+    """What is selected of every pair's rejection, in NumPy: the stages in turn, each
+    for the pairs left in doubt."""
+    first, *others = stages(procedure, pairs.x_left.shape[-1])
+    out, again = decided(pairs, first, select, way, report)
+    for stage in others:
+        rest = np.flatnonzero(again)
+        if rest.size:
+            left_over = jax.tree.map(lambda a, rest=rest: a[rest], pairs)
+            out, again = _replaced(
+                (out, again), rest, decided(left_over, stage, select, way, unheard)
+            )
+    return out
+
+
+def decided(
+    pairs: Pair,
+    procedure: AbstractProcedure,
+    select: Callable[[Rejection], PyTree],
+    way: Way,
+    report: Report,
+) -> tuple[PyTree, np.ndarray]:
+    """What is selected of every pair's rejection, in NumPy, and for which pairs the
+    procedure was in doubt."""
+    chunk = _chunk(pairs, way.chunk)
+    # a search has many subsets of each pair in work, and goes on until the last pair of
+    # its chunk is served
+    if way.chunk is None:
+        chunk = min(chunk, _searched_together(procedure))
+    program = Program(
+        _slab_cleaned,
+        {"procedure": procedure, "select": select, "chunk": chunk},
+        _settings(pairs),
+    )
+    return spread(pairs, program, way, chunk, report)
+
+
+def map_batch(
+    function: Callable[[Pair], PyTree],
+    pairs: Pair,
+    *,
+    progress: Report | None = None,
+    threads: int | None = None,
+    chunk: int | None = None,
+) -> PyTree:
+    """Any function of one pair, of every pair of a batch and on all cores; keywords as
+    of `orient_batch`.
+
+    For procedures and studies of one's own: `map_batch(lambda pair: orient(pair,
+    loss=Huber()).m_q, pairs)`. A function object is compiled once. It should not use
+    LAPACK (`jnp.linalg`): calls of it from several threads can wait for one another for
+    ever; `threads=1` avoids that.
+    """
+    chunk = _chunk(pairs, chunk)
+    program = Program(
+        _slab_mapped, {"function": function, "chunk": chunk}, _settings(pairs)
+    )
+    host, way = jax.tree.map(np.asarray, pairs), Way(threads, chunk)
+    return _finish(spread(host, program, way, chunk, progress or unheard))
+
+
+def _searched_together(procedure: AbstractProcedure) -> int:
+    """Pairs per chunk at most, by the subsets of each pair that are in work."""
+    kinds = (AbstractHypotheses, Search)
+    is_kind = lambda part: isinstance(part, kinds)
+    blocks = [
+        part.block
+        for part in jax.tree.leaves(procedure, is_leaf=is_kind)
+        if is_kind(part)
+    ]
+    return min([max(SUBSETS // block, 1) for block in blocks], default=1 << 16)
+
+
+def _chunk(pairs: Pair, chunk: int | None) -> int:
+    """Pairs per chunk, as given or by the number of points."""
+    if pairs.x_left.ndim != 2:
+        raise ValueError(
+            "a batch of pairs (pair, point) is wanted, got coordinates of shape "
+            f"{pairs.x_left.shape}"
+        )
+    if chunk is not None:
+        return operator.index(chunk)
+    fitting = max(CHUNK_POINTS // max(pairs.x_left.shape[1], 1), 4)
+    return min(128, 1 << fitting.bit_length() - 1)
+
+
+def _settings(pairs: Pair, lasting: dict[str, Any] | None = None) -> dict[str, Any]:
+    """How to compile for so many pairs: the longer they take, the more is gained by
+    what takes long to compile."""
+    points = pairs.x_left.size
+    if points <= MOMENT:
+        return QUICKEST
+    if lasting is not None:
+        return lasting
+    if points <= SOON:
+        return QUICK
+    return FAST if pairs.x_left.shape[1] > FEW else FAST | WIDE
+
+
+def _slab(pairs: Pair, *, read: Callable, chunk: int, **options) -> PyTree:
+    return chunked(lambda pair: read(pair, orient(pair, **options)), pairs, chunk)
+
+
+def _slab_mapped(pairs: Pair, *, function: Callable, chunk: int) -> PyTree:
+    return chunked(function, pairs, chunk)
+
+
+def _slab_near(
+    pairs: Pair, *, read: Callable, chunk: int, start: Auto, **options
+) -> tuple[PyTree, Array]:
+    def one(pair: Pair):
+        orientation, fits = orient_near(pair, start=start, **options)
+        return read(pair, orientation), fits
+
+    return chunked(one, pairs, chunk)
+
+
+def _slab_cleaned(
+    pairs: Pair, *, procedure: AbstractProcedure, select: Callable, chunk: int
+) -> tuple[PyTree, Array]:
+    """What is selected, and whether the procedure was not convinced."""
+
+    def one(pair: Pair):
+        rejection = procedure(pair)
+        return select(rejection), rejection.outcome == OUTCOMES.no_consensus
+
+    return chunked(one, pairs, chunk)
+
+
+def _finish(out: PyTree) -> PyTree:
+    """NumPy leaves as JAX arrays in the same memory, which nobody else holds."""
+    return jax.device_put(out, may_alias=True)

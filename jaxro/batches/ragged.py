@@ -1,0 +1,420 @@
+"""Pairs of every length in few batches: flat arrays, padded to the few sizes that waste
+least."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from itertools import starmap
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, PyTree
+
+from ..geometry.pairs import Pair, double, pair
+from ..orientation.orient import Orientation
+from ..orientation.starts import AbstractStart, Auto
+from ..rejection import AbstractProcedure, Rejection
+from .batch import (
+    Report,
+    Way,
+    decided,
+    oriented,
+    oriented_near,
+    settled,
+    stages,
+    unheard,
+)
+from .padding import Plan, planned
+
+LONG = 64
+"""Points from which values are moved quicker pair by pair than all together."""
+
+Flat = Float[np.ndarray, " row"]
+
+
+class Ragged(NamedTuple):
+    """Pairs of any lengths one behind the other, in NumPy: pair k has the rows
+    `begins[k]` to `begins[k + 1]`."""
+
+    begins: Int[np.ndarray, " pairs+1"]
+    x_left: Flat
+    y_left: Flat
+    x_right: Flat
+    y_right: Flat
+    sigma: Flat
+    mask: Bool[np.ndarray, " row"]
+    focal_left: Float[np.ndarray, " pair"]
+    focal_right: Float[np.ndarray, " pair"]
+
+    @property
+    def lengths(self) -> Int[np.ndarray, " pair"]:
+        """Points of every pair."""
+        return np.diff(self.begins)
+
+    def padded(self, members: Int[np.ndarray, " some"], size: int) -> Pair:
+        """These pairs as one batch, in NumPy. What stands behind a shorter one up to
+        `size` points is masked out."""
+        first, last, lengths = members[0], members[-1], self.lengths[members]
+        points = (
+            self.x_left,
+            self.y_left,
+            self.x_right,
+            self.y_right,
+            self.sigma,
+            self.mask,
+        )
+        if last - first + 1 == len(members) and np.all(
+            lengths == size
+        ):  # a batch as they are
+            fields = [
+                a[self.begins[first] : self.begins[last + 1]].reshape(-1, size)
+                for a in points
+            ]
+        else:
+            # all windows of this size, of which some are copied whole: many times
+            # faster than point by point
+            end = self.begins[members[-1]] + size
+            enough = lambda a: (
+                a if end <= len(a) else np.append(a, np.zeros(size, a.dtype))
+            )
+            windows = lambda a: np.lib.stride_tricks.sliding_window_view(
+                enough(a), size
+            )
+            fields = [windows(a)[self.begins[members]] for a in points]
+            fields[-1] = np.logical_and(
+                fields[-1], np.arange(size)[None, :] < lengths[:, None]
+            )
+        return jax.tree.unflatten(
+            _structure(), [*fields, self.focal_left[members], self.focal_right[members]]
+        )
+
+    def gather(
+        self,
+        members: Int[np.ndarray, " some"],
+        batches: Sequence[np.ndarray],
+        out: Sequence[np.ndarray],
+    ) -> None:
+        """The values (pair, point) of these pairs into their rows of `out`, for several
+        values of one batch."""
+        size = batches[0].shape[1] if batches else 0
+        begins, lengths = self.begins[members], self.lengths[members]
+        if size >= LONG:
+            spans = list(zip(begins.tolist(), lengths.tolist(), strict=True))
+            for target, batch in zip(out, batches, strict=True):
+                for values, (begin, length) in zip(batch, spans, strict=True):
+                    target[begin : begin + length] = values[:length]
+            return
+        there = np.arange(size)[None, :] < lengths[:, None]
+        rows = (begins[:, None] + np.arange(size)[None, :])[there]
+        for target, batch in zip(out, batches, strict=True):
+            target[rows] = batch[there]
+
+
+@lru_cache
+def _structure() -> Any:
+    """Of a `Pair`, to be filled with arrays of NumPy."""
+    return jax.tree.structure(
+        jax.eval_shape(lambda: pair(*(jnp.zeros((4, 1))), focal=1.0))
+    )
+
+
+def join(pairs: Sequence[Pair]) -> Ragged:
+    """Single pairs of any lengths as one `Ragged`. Raises ValueError for none."""
+    if not pairs:
+        raise ValueError("join: no pairs given")
+    if any(one.x_left.ndim != 1 for one in pairs):
+        raise ValueError(
+            "join: single pairs are wanted, got a batch (pair, point): take it apart "
+            "with unstack"
+        )
+    begins = np.cumsum([0] + [one.x_left.shape[-1] for one in pairs])
+    fields = {
+        name: [np.asarray(getattr(one, name)) for one in pairs]
+        for name in Ragged._fields[1:]
+    }
+    return Ragged(
+        begins,
+        *(
+            np.stack(a) if name.startswith("focal") else np.concatenate(a)
+            for name, a in fields.items()
+        ),
+    )
+
+
+def joined(parts: Sequence[Ragged]) -> Ragged:
+    """The pairs of several `Ragged` one behind the other."""
+    ends = np.cumsum([0] + [part.begins[-1] for part in parts])
+    begins = np.concatenate(
+        [[0], *(part.begins[1:] + end for part, end in zip(parts, ends, strict=False))]
+    )
+    return Ragged(
+        begins,
+        *(
+            np.concatenate(fields)
+            for fields in zip(*(part[1:] for part in parts), strict=True)
+        ),
+    )
+
+
+def checked(pairs: Ragged) -> Ragged:
+    """The pairs in double precision. Raises ValueError where there are none."""
+    if len(pairs.begins) < 2:
+        raise ValueError(
+            "no pairs: `begins` has to hold the first row of every pair and the end of "
+            "the last"
+        )
+    return double(pairs)
+
+
+PER_POINT = ("parallax", "residuals", "redundancy", "model", "in_front")
+"""What an `Orientation` holds of every point."""
+
+
+def split(pair: Pair, orientation: Orientation) -> tuple[PyTree, PyTree]:
+    """An orientation in what it holds of the pair and of the points."""
+    fields = lambda o: [getattr(o, name) for name in PER_POINT]
+    nothing = eqx.tree_at(
+        fields, jax.tree.map(lambda _: True, orientation), replace_fn=lambda _: False
+    )
+    return eqx.partition(orientation, nothing)
+
+
+def orient_ragged(
+    pairs: Ragged,
+    *,
+    read: Callable[[Pair, Orientation], tuple[PyTree, PyTree]] = split,
+    plan: Plan | None = None,
+    progress: Report | None = None,
+    threads: int | None = None,
+    start: AbstractStart | Any = Auto(),  # noqa: B008 (frozen)
+    **options,
+) -> PyTree:
+    """`orient` of pairs of any lengths, on all cores: an `Orientation` in NumPy whose
+    fields of the points are flat, in the rows of `pairs`.
+
+    `read(pair, orientation)`: what is wanted instead, of the pair and of every point;
+    the result then is these two. Other keywords are those of `orient`. The results are
+    those of `orient` one by one, to rounding.
+    """
+    pairs = checked(pairs)
+    plan = _fitting(plan, pairs)
+    options = settled(options | {"start": start}) | {"read": read}
+    out = _Out(pairs, progress)
+    rest = [np.zeros(0, int)]
+    batches = _batches(pairs, plan.sizes, plan.slabs, threads)
+    in_turn = threads == 1 or len(batches) == 1
+    told = (
+        out.told if in_turn else unheard
+    )  # what runs beside the calling thread tells nobody
+
+    def near(
+        members: np.ndarray, size: int, way: Way
+    ) -> tuple[np.ndarray, int, PyTree, np.ndarray]:
+        found, fits = oriented_near(pairs.padded(members, size), options, way, told)
+        return members, size, found, members[~fits]
+
+    def given(
+        members: np.ndarray, size: int, way: Way
+    ) -> tuple[np.ndarray, int, PyTree, np.ndarray]:
+        return (
+            members,
+            size,
+            oriented(pairs.padded(members, size), options, way, told),
+            members[:0],
+        )
+
+    first = near if isinstance(start, Auto) else given
+    for members, size, found, left in (
+        starmap(first, batches) if in_turn else _overlapping(first, batches)
+    ):
+        out.store(members, size, found)
+        if not in_turn:
+            out.told(len(members), len(members))
+        rest.append(left)
+    general = options | {"start": getattr(start, "general", start)}
+    for members, size, way in _batches(
+        pairs, plan.fewer, None, threads, np.concatenate(rest)
+    ):
+        out.store(members, size, oriented(pairs.padded(members, size), general, way))
+    return eqx.combine(*out.tree) if read is split else out.tree
+
+
+class Decisions(NamedTuple):
+    """What a procedure decided: of every row whether it is kept, in which round it
+    went, and its statistic then; of every pair the outcome, a number of
+    `rejection.OUTCOMES`; of every row whether it is `undecided`."""
+
+    kept: Bool[np.ndarray, " row"]
+    order: Int[np.ndarray, " row"]
+    statistic: Flat
+    outcome: Int[np.ndarray, " pair"]
+    undecided: Bool[np.ndarray, " row"]
+
+
+def decisions(rejection: Rejection) -> tuple[PyTree, PyTree]:
+    """The outcome of a pair; of every point (kept, order, statistic, undecided)."""
+    return rejection.outcome._value, (
+        rejection.mask,
+        rejection.order,
+        rejection.statistic,
+        rejection.undecided,
+    )
+
+
+def clean_ragged(
+    pairs: Ragged,
+    procedure: AbstractProcedure,
+    *,
+    select: Callable[[Rejection], tuple[PyTree, PyTree]] = decisions,
+    plan: Plan | None = None,
+    progress: Report | None = None,
+    threads: int | None = None,
+) -> PyTree:
+    """`procedure` of pairs of any lengths, on all cores: its `Decisions`, flat, in the
+    rows of `pairs`.
+
+    `select(rejection)`: what is wanted instead, of the pair and of every point; the
+    result then is these two.
+    """
+    pairs = checked(pairs)
+    plan = _fitting(plan, pairs)
+    out = _Out(pairs, progress)
+    every = stages(procedure, max(plan.sizes))
+    doubtful = [
+        [np.zeros(0, int)] for _ in every
+    ]  # by the number of procedures that are left for a pair
+    for members, size, way in _batches(pairs, plan.sizes, None, threads):
+        first, *others = stages(procedure, size)
+        found, doubt = decided(
+            pairs.padded(members, size), first, select, way, out.told
+        )
+        out.store(members, size, found)
+        doubtful[len(others)].append(members[doubt])
+    for left in range(len(every) - 1, 0, -1):
+        for members, size, way in _batches(
+            pairs, plan.fewer, None, threads, np.concatenate(doubtful[left])
+        ):
+            found, doubt = decided(
+                pairs.padded(members, size), every[-left], select, way, unheard
+            )
+            out.store(members, size, found)
+            doubtful[left - 1].append(members[doubt])
+    if select is not decisions:
+        return out.tree
+    outcome, (kept, order, statistic, undecided) = out.tree
+    return Decisions(
+        kept=kept,
+        order=order,
+        statistic=statistic,
+        outcome=outcome,
+        undecided=undecided,
+    )
+
+
+def _fitting(plan: Plan | None, pairs: Ragged) -> Plan:
+    """The plan, or one for these pairs. Raises ValueError if it is for shorter ones."""
+    if plan is None:
+        return planned(pairs.lengths)
+    longest, most = int(np.max(pairs.lengths)), min(plan.sizes[-1], plan.fewer[-1])
+    if longest > most:
+        raise ValueError(
+            f"the plan is for pairs of up to {most} points, but pair "
+            f"{int(np.argmax(pairs.lengths))} has {longest}: "
+            "plan with the longest of all parts"
+        )
+    return plan
+
+
+def _batches(
+    pairs: Ragged,
+    sizes: tuple[int, ...],
+    slabs: tuple[int, ...] | None,
+    threads: int | None,
+    members: Int[np.ndarray, " some"] | None = None,
+) -> list[tuple[np.ndarray, int, Way]]:
+    """(members, size to pad them to, way) of each size; of all pairs or of some.
+    Without `slabs` a call takes one chunk."""
+    members = np.arange(len(pairs.lengths)) if members is None else np.sort(members)
+    bucket = np.searchsorted(sizes, pairs.lengths[members])
+    every = [members[bucket == number] for number in range(len(sizes))]
+    calls = slabs or (1,) * len(sizes)
+    return [
+        (own, size, Way(threads, slab=call))
+        for own, size, call in zip(every, sizes, calls, strict=True)
+        if own.size
+    ]
+
+
+def _overlapping(work: Callable, batches: Sequence[tuple]) -> Iterator[tuple]:
+    """work(*batch) of every batch, two at a time: one is padded, or put in order by the
+    caller, while another is calculated. The longest first, so that both end
+    together."""
+    pool = ThreadPoolExecutor(2)
+    try:
+        yield from pool.map(lambda batch: work(*batch), reversed(batches))
+    finally:
+        pool.shutdown(
+            wait=False, cancel_futures=True
+        )  # who interrupts does not wait for a program to be compiled
+
+
+class _Out:
+    """The results of all pairs, filled batch by batch, and how many are done."""
+
+    def __init__(self, pairs: Ragged, progress: Report | None):
+        self.tree: Any = None
+        self._pairs, self._progress, self._before = pairs, progress or unheard, 0
+
+    def told(self, done: int, total: int) -> None:
+        """Progress within one batch."""
+        if done == total:
+            self._before += total
+        self._progress(
+            self._before + (0 if done == total else done), len(self._pairs.lengths)
+        )
+
+    def store(
+        self, members: np.ndarray, size: int, found: tuple[PyTree, PyTree]
+    ) -> None:
+        """The values of these pairs, and of their points in the rows of all. Raises
+        ValueError for anything else."""
+        if not isinstance(found, tuple) or len(found) != 2:
+            raise ValueError(
+                "of ragged pairs two things are read: (what is of the pair, what is of "
+                "every point)"
+            )
+        for of_points in jax.tree.leaves(found[1]):
+            if of_points.shape[:2] != (len(members), size):
+                raise ValueError(
+                    "what is read of every point has the points on its first axis, "
+                    f"{size} of them here, but a value "
+                    f"has the shape {of_points.shape[1:]}"
+                )
+        if len(members) == len(self._pairs.lengths) and np.all(
+            self._pairs.lengths == size
+        ):
+            # nothing to put in order
+            self.tree = (
+                found[0],
+                jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), found[1]),
+            )
+            return
+        if self.tree is None:
+            sizes = len(self._pairs.lengths), len(self._pairs.x_left)
+            empty = lambda count, drop: (
+                lambda a: np.empty((count, *a.shape[drop:]), a.dtype)
+            )
+            self.tree = (
+                jax.tree.map(empty(sizes[0], 1), found[0]),
+                jax.tree.map(empty(sizes[1], 2), found[1]),
+            )
+        for target, source in zip(
+            jax.tree.leaves(self.tree[0]), jax.tree.leaves(found[0]), strict=True
+        ):
+            target[members] = source
+        self._pairs.gather(
+            members, jax.tree.leaves(found[1]), jax.tree.leaves(self.tree[1])
+        )

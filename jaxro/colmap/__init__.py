@@ -1,0 +1,1 @@
+"""COLMAP databases: cameras, matches, and the geometries of their pairs."""

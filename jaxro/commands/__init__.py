@@ -1,0 +1,1 @@
+"""What `jaxro NAME` does, one file a command."""

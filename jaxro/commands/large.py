@@ -1,0 +1,396 @@
+"""One call of `jaxro orient` or `jaxro clean` with Parquet tables, from its options to
+the end of the work."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+
+from .. import __version__
+from ..batches.padding import planned
+from ..batches.ragged import Ragged, joined
+from ..batches.table_noise import PAIRS
+from ..rejection import AbstractProcedure
+from ..reports.pair import table as terminal_table
+from ..reports.records import TABLES, Recorder
+from ..reports.solutions import WARNED
+from ..reports.terminal import consoles, progress
+from ..tables import parquet, whole
+from ..tables.cameras import Cameras, check_one_sigma
+from ..tables.conversion import converted
+from ..tables.fields import TableError
+from . import orient as jobs, sigma as deviation
+from .orient import Options
+from .stream import (
+    CONVERTED,
+    JOURNAL,
+    MODIFIED,
+    PART_ROWS,
+    Job,
+    Work,
+    asked_before,
+    here,
+    parts,
+)
+from .tolerances import check_sigma, tolerances
+
+REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
+"""What may be in a folder whose place the results take."""
+
+PLACES = 8
+"""Runs of pairs, from the begin to the end of a table, that tell its noise."""
+
+WORKED_ON = (
+    *REPLACED,
+    CONVERTED,
+    *(str(Path(name).with_suffix(".partial")) for name in (JOURNAL, CONVERTED)),
+)
+"""What may be in the folder of a run that was stopped."""
+
+
+@dataclass(frozen=True)
+class Large:
+    """What the user asked for besides `Options`."""
+
+    tables: str | None = None
+    resume: bool = False
+    part_rows: int = PART_ROWS
+    engine: Callable[[Job, Callable[[int], None]], Iterable[dict[str, Any]]] = here
+
+
+def run(
+    options: Options,
+    large: Large,
+    procedure: tuple[str, AbstractProcedure] | None = None,
+) -> bool:
+    """Plan, work, tell. True if every pair is cleaned and usable. Raises TableError;
+    finished parts can be resumed."""
+    started = time.monotonic()
+    console, errors = consoles()
+    job = prepared(options, large, procedure)
+    told = "Cleaning" if procedure else "Orienting"
+    try:
+        with progress(errors, told, job.pairs) as tell:
+            tell(job.done)
+            for entry in large.engine(job, tell):
+                job.finished(entry)
+        _check_place(
+            job.target, options.force
+        )  # what may have appeared there meanwhile
+        summary = job.end()
+    except (OSError, parquet.pa.ArrowException) as error:
+        raise _refused(
+            job.work.file, job.work.folder, error, "; what is finished --resume keeps"
+        ) from None
+    except KeyboardInterrupt:
+        errors.print(
+            f"{len(job.entries)} of {len(job.parts)} parts are finished; --resume goes "
+            "on",
+            markup=False,
+        )
+        raise
+    show(console, job, summary, time.monotonic() - started)
+    return good(summary)
+
+
+def good(summary: dict[str, Any]) -> bool:
+    """Whether every pair is cleaned, where that was asked for, and usable."""
+    usable = sum(summary["results"].get(name, 0) for name in ("successful", *WARNED))
+    finished = (
+        summary["outcomes"].get("finished", 0)
+        if "outcomes" in summary
+        else summary["pairs"]
+    )
+    return usable == finished == summary["pairs"]
+
+
+def prepared(
+    options: Options, large: Large, procedure: tuple[str, AbstractProcedure] | None
+) -> Job:
+    """The job, its journal begun or read. Raises TableError, and then leaves nothing
+    that was not there before."""
+    if options.file is None or options.out is None:
+        missing = "FILE" if options.file is None else "--out"
+        raise TableError(
+            missing,
+            None,
+            None,
+            "nothing",
+            "a table and --out DIR where results are Parquet tables",
+        )
+    chosen = tuple(
+        name.strip()
+        for name in (large.tables or "elements,residuals,points").split(",")
+    )
+    for name in chosen:
+        if name not in TABLES:
+            raise TableError(
+                "--tables", None, None, repr(name), f"some of {','.join(TABLES)}"
+            )
+    whole.check_name(options.out, "a name for the folder of results")
+    out = options.out.resolve()
+    folder = out.with_name(f"{out.name}.unfinished")
+    if large.resume and not folder.exists() and (out / JOURNAL).exists():
+        os.replace(out, folder)  # stopped when only its journal was left to be removed
+    _check(options, out, folder, large.resume)
+    stopped = None
+    if (
+        folder.exists() and not large.resume
+    ):  # kept until the table and all options are known to be good
+        stopped = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+        os.replace(folder, stopped)
+    try:
+        job = _planned(options, large, procedure, chosen, folder)
+        job.go_on() if large.resume and job.begun else job.begin()
+    except BaseException as error:
+        if not large.resume:
+            shutil.rmtree(folder, ignore_errors=True)
+        if stopped is not None:
+            os.replace(stopped, folder)
+        if isinstance(error, OSError | parquet.pa.ArrowException):
+            raise _refused(options.file, folder, error) from None
+        raise
+    if stopped is not None:
+        shutil.rmtree(stopped)
+    return job
+
+
+def _refused(
+    file: Path, folder: Path, error: BaseException, more: str = ""
+) -> TableError:
+    """What the disk or a damaged table said."""
+    found = getattr(error, "strerror", None) or str(error).splitlines()[0]
+    expected = (
+        f"a table that can be read and a folder {folder} that can be written{more}"
+    )
+    return TableError(file, None, None, found, expected)
+
+
+def _planned(
+    options: Options,
+    large: Large,
+    procedure: tuple[str, AbstractProcedure] | None,
+    chosen: tuple[str, ...],
+    folder: Path,
+) -> Job:
+    assert options.file is not None and options.out is not None
+    source = options.file
+    if not whole.is_parquet(source):
+        source = folder / CONVERTED
+        if not (large.resume and source.exists() and (folder / JOURNAL).exists()):
+            folder.mkdir(parents=True, exist_ok=True)
+            converted(options.file, source)
+    table = parquet.Source(source, options.file)
+    system = jobs.SYSTEMS[options.elements or "relative"]
+    jobs.check_numbers(options, table.has_sigma, str(options.file), system)
+    known = table.has_sigma or options.sigma is not None
+    if procedure is not None:
+        check_sigma(*procedure, known)
+    scan = table.scan()
+    cameras = jobs.read_cameras(options, jobs.MEASURED)
+    _check_cameras(cameras, scan, table, known)
+    noise = None
+    if options.sigma == deviation.AUTO:
+        before = deviation.from_entry(asked_before(folder)) if large.resume else None
+        noise = before or deviation.from_residuals(_sample(table, scan, cameras))
+    sigma = deviation.stated(options.sigma) if noise is None else noise.sigma
+    pieces = parts(scan.begins, large.part_rows)
+    keywords = {
+        "elements": system,
+        "base": options.base,
+        "residual": jobs.RESIDUALS[options.residual],
+    }
+    order = tuple(name for name in TABLES if name in ("elements", *chosen))
+    if procedure and "residuals" not in order:
+        order = (*order[:1], "residuals", *order[1:])
+    request = _request(
+        replace(options, sigma=sigma), order, procedure
+    ) | deviation.entry(noise)
+    work = Work(
+        source.absolute(),
+        options.file,
+        folder,
+        planned(scan.lengths, len(pieces)),
+        cameras,
+        sigma,
+        Recorder(system, order, known, procedure is not None),
+        keywords,
+        jobs.units_of(options, table.has_sigma, system),
+        procedure[1] if procedure else None,
+    )
+    return Job(work, pieces, options.out.resolve(), request)
+
+
+def _sample(table: parquet.Source, scan: parquet.Scan, cameras: Cameras) -> Ragged:
+    """The pairs whose residuals tell sigma: all of a small table, else PLACES runs of
+    them, evenly spread."""
+    count = len(scan.begins) - 1
+    run, places = (count, 1) if count <= PAIRS else (PAIRS // PLACES, PLACES)
+    firsts = np.linspace(0, count - run, places).astype(int)
+    return joined(
+        [
+            _rows(table, scan.begins[first : first + run + 1], cameras)
+            for first in firsts
+        ]
+    )
+
+
+def _rows(table: parquet.Source, begins: np.ndarray, cameras: Cameras) -> Ragged:
+    """Pairs of the table whose standard deviations are its unit."""
+    rows = table.rows(int(begins[0]), int(begins[-1]))
+    own = begins - begins[0]
+    names = parquet.names(rows, own[:-1], str(table.path))
+    return parquet.ragged(rows, own, cameras.of_all(names, str(table.path)), 1.0)
+
+
+def _check_cameras(
+    cameras: Cameras, scan: parquet.Scan, table: parquet.Source, sigma: bool
+) -> None:
+    """Raises TableError for a pair without cameras, or with two that one sigma cannot
+    serve."""
+    one_for_all = cameras.left is not None and cameras.right is not None
+    names = (
+        scan.names.slice(0, 1).to_pylist() if one_for_all else scan.names.to_pylist()
+    )
+    for name, row in zip(names, scan.begins[:-1].tolist(), strict=False):
+        try:
+            both = cameras.of(str(name), str(table.path))
+            if sigma:
+                check_one_sigma(str(table.path), None, *both)
+        except TableError as error:
+            raise TableError(
+                error.file, table.place(row), error.column, error.found, error.expected
+            ) from None
+
+
+def _check(options: Options, out: Path, folder: Path, resume: bool) -> None:
+    """Raises TableError unless the work may begin, or go on."""
+    read = [
+        file.resolve() for file in (options.file, options.camera) if file is not None
+    ]
+    _check_place(out, options.force, read)
+    _check_place(folder, True, read, WORKED_ON)
+    if resume and not folder.exists():
+        raise TableError(
+            folder,
+            None,
+            None,
+            "no such folder",
+            "the --out of a run that was stopped, to resume it",
+        )
+    if folder.exists() and not resume and not options.force:
+        expected = "--resume to go on, or --force to begin anew"
+        raise TableError(folder, None, None, "a run that was stopped", expected)
+
+
+def _check_place(
+    folder: Path, force: bool, read: Sequence[Path] = (), ours: Sequence[str] = REPLACED
+) -> None:
+    """Raises TableError unless results may take the place of the whole folder, in which
+    nothing else is or is read."""
+    whole.check_target(folder, force)
+    others = (
+        sorted(entry.name for entry in folder.iterdir() if entry.name not in ours)
+        if folder.exists()
+        else []
+    )
+    inside = [file for file in read if folder in file.parents]
+    if others or inside:
+        found = (
+            f"{', '.join(others[:5])}, no tables of an earlier run"
+            if others
+            else f"{inside[0]}, to be read"
+        )
+        raise TableError(
+            folder,
+            None,
+            None,
+            found,
+            "another --out: Parquet results take the place of the whole folder",
+        )
+
+
+def _request(
+    options: Options,
+    tables: tuple[str, ...],
+    procedure: tuple[str, AbstractProcedure] | None,
+) -> dict:
+    """What is asked for, as the journal and the summary keep it; another request does
+    not resume a run."""
+    assert options.file is not None
+    asked: dict[str, Any] = {
+        "program": f"jaxro {__version__}",
+        "file": str(options.file),
+    }
+    read = [file for file in (options.file, options.camera) if file is not None]
+    asked |= {
+        "bytes": options.file.stat().st_size,
+        MODIFIED: [file.stat().st_mtime_ns for file in read],
+    }
+    asked["tables"] = list(tables)
+    named = {
+        "camera",
+        "focal",
+        "principal_point",
+        "pixel_size",
+        "y_down",
+        "sigma",
+        "elements",
+        "base",
+        "residual",
+    }
+    asked |= {name: _plain(getattr(options, name)) for name in sorted(named | {"unit"})}
+    asked["elements"] = options.elements or "relative"
+    if procedure is not None:
+        asked |= {"procedure": procedure[0], "tolerances": tolerances(procedure[1])}
+    return asked
+
+
+def _plain(value: Any) -> Any:
+    return (
+        str(value)
+        if isinstance(value, Path)
+        else list(value)
+        if isinstance(value, tuple)
+        else value
+    )
+
+
+def show(console: Console, job: Job, summary: dict[str, Any], seconds: float) -> None:
+    """How the pairs ended, and where the tables are."""
+    for kind, title in (("outcomes", "cleaning"), ("results", "orientation")):
+        if kind in summary:
+            rows = terminal_table(title, "pairs", "%")
+            for name, number in summary[kind].items():
+                rows.add_row(
+                    name, f"{number:,}", f"{100 * number / summary['pairs']:.2f}"
+                )
+            console.print(rows)
+    doubles = summary["pairs_with_two_points_of_one_name"]
+    if doubles:
+        named = ", ".join(doubles[:5]) + (", ..." if len(doubles) > 5 else "")
+        console.print(
+            f"[yellow]Mind:[/yellow] two points of one name in pairs {escape(named)}"
+        )
+    noise = deviation.from_entry(job.request)
+    if noise is not None:
+        console.print(
+            deviation.sentence(noise, "in the unit of the table"), markup=False
+        )
+    pairs = "1 pair" if summary["pairs"] == 1 else f"{summary['pairs']:,} pairs"
+    rate = f"{pairs}, {summary['rows']:,} points in {seconds:.1f} s"
+    tables = ", ".join(
+        name
+        for name in (*job.work.recorder.tables, "cleaned")
+        if (job.target / name).exists()
+    )
+    console.print(
+        f"{rate}. Written to {job.target}: {tables}, summary.json", markup=False
+    )

@@ -1,0 +1,1 @@
+"""One stereo pair: what was measured, and how the photos lie."""

@@ -1,0 +1,222 @@
+"""The coplanarity condition, the strict y-parallax and the intersection of one point.
+
+    g = b . (p1 x R p2) = 0,    p = (x, y, -f)
+
+Two ways to adjust it, each a function of the pair that says what is adjusted:
+condition, observations, cofactors.
+
+* `rigorous`: all four coordinates are measured with errors; the whitened residual is g
+  / sqrt(B Q Bᵀ), B = dg/dl. Statistically right, the default.
+* `parallax`: the y-parallax q of the photos turned parallel to the base is taken as
+  measured with unit weight, as in the papers (Dorozhinsky 1971, Table 2).
+
+Both residuals are in the unit of the coordinates when sigma is 1.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from . import rotations as rot
+from .elements import AbstractElements, essential
+from .pairs import Pair
+from .rotations import Matrix, Vector
+
+Scalar = Float[Array, "..."]
+Point = tuple[Scalar, Scalar, Scalar, Scalar]
+"""x_left, y_left, x_right, y_right of one point"""
+
+
+class Adjusted(NamedTuple):
+    """What `adjust` needs: prepare(R, b) once for the pair, condition(prepared,
+    observation) of one point, and the observations and cofactors of all points."""
+
+    prepare: Callable
+    condition: Callable
+    observations: tuple
+    cofactor: PyTree
+
+
+def fundamental_matrix(
+    rotation: Matrix, base: Vector, focal_left: Scalar, focal_right: Scalar
+) -> Matrix:
+    """F = diag(1, 1, -f1) E diag(1, 1, -f2), so that g = (x1, y1, 1) F (x2, y2, 1)ᵀ;
+    once for a pair."""
+    e = essential(rotation, base)
+    return (
+        (e[0][0], e[0][1], -focal_right * e[0][2]),
+        (e[1][0], e[1][1], -focal_right * e[1][2]),
+        (
+            -focal_left * e[2][0],
+            -focal_left * e[2][1],
+            focal_left * focal_right * e[2][2],
+        ),
+    )
+
+
+def common_focal(focal_left: Scalar, focal_right: Scalar) -> Scalar:
+    """f with 2 / f² = 1 / f1² + 1 / f2²: sigma / f is the standard deviation of
+    directions in the mean of both."""
+    return jnp.sqrt(2 / (1 / focal_left**2 + 1 / focal_right**2))
+
+
+def condition(f: Matrix, point: Point) -> Scalar:
+    """g of one point, from the fundamental matrix of the pair."""
+    x1, y1, x2, y2 = point
+    a, b, c = (row[0] * x2 + row[1] * y2 + row[2] for row in f)
+    return x1 * a + y1 * b + c
+
+
+def turned(rotation: Matrix, base: Vector) -> tuple[Matrix, Matrix]:
+    """Rotations of the left and right photo into the frame parallel to the base.
+
+    X runs along the base and the left photo is not turned about X: Y = z x X / |z x X|
+    with z the axis of the left photo. These are the papers' R_alpha R_chi and R_alpha'
+    R_omega' R_chi', without their angles; undefined only for a base along the photo
+    axis.
+    """
+    across = rot.length(base[0], base[1])
+    x = rot.unit(base)
+    y = (-base[1] / across, base[0] / across, jnp.zeros_like(across))
+    left = (x, y, rot.cross(x, y))
+    return left, rot.product(left, rotation)
+
+
+def y_parallax(
+    rows: tuple, point: Point, focal_left: Scalar, focal_right: Scalar
+) -> Scalar:
+    """q = y1* - y2* = -f1 (Y1/Z1 - Y2/Z2) of one point; `rows` are the Y and Z rows of
+    the two rotations `turned`."""
+    x1, y1, x2, y2 = point
+    rays = (x1, y1, -focal_left), (x2, y2, -focal_right)
+    (y1, z1), (y2, z2) = (
+        [rot.dot(row, ray) for row in turn]
+        for turn, ray in zip(rows, rays, strict=True)
+    )
+    # one division, and that by itself: its derivatives then divide no more: a twelfth
+    # of a solution
+    return focal_left * (y2 * z1 - y1 * z2) * (1 / (z1 * z2))
+
+
+def parallax_of(pair: Pair, pose: AbstractElements) -> Callable:
+    """q of a point of a pair, as a function of its coordinates."""
+    rows = tuple(frame[1:] for frame in turned(*pose.relative()))
+    return lambda point: y_parallax(rows, point, pair.focal_left, pair.focal_right)
+
+
+def parallaxes(pair: Pair, pose: AbstractElements) -> Float[Array, " point"]:
+    """q of all points of a pair, whether they take part or not."""
+    return jax.vmap(parallax_of(pair, pose))(pair.coordinates)
+
+
+def rigorous(pair: Pair) -> Adjusted:
+    """Adjust the four image coordinates of every point."""
+    prepare = lambda rotation, base: fundamental_matrix(
+        rotation, base, pair.focal_left, pair.focal_right
+    )
+    return Adjusted(prepare, condition, pair.coordinates, pair.sigma**2)
+
+
+def parallax(pair: Pair) -> Adjusted:
+    """Adjust the y-parallax of every point as if it had been measured; the coordinates
+    are taken as free of error."""
+
+    def prepare(rotation: Matrix, base: Vector):
+        left, right = turned(rotation, base)
+        return left[1:], right[1:], pair.focal_left, pair.focal_right
+
+    def of_point(prepared: tuple, observation: tuple[Point, Scalar]) -> Scalar:
+        left, right, *focals = prepared
+        point, measured = observation
+        return y_parallax((left, right), point, *focals) - measured
+
+    return Adjusted(
+        prepare,
+        of_point,
+        (pair.coordinates, jnp.zeros_like(pair.sigma)),
+        (None, pair.sigma**2),
+    )
+
+
+def linearised(
+    f: Matrix, point: Point, use: Bool[Array, "..."]
+) -> tuple[Scalar, Scalar, Point]:
+    """g of one point, the square |B|² of its gradient by the coordinates (1 where it is
+    not used), and B itself."""
+    g, gradient = jax.value_and_grad(condition, argnums=1)(f, point)
+    return g, jnp.where(use, sum(entry**2 for entry in gradient), 1.0), gradient
+
+
+def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:
+    """v = -Q Bᵀ (B Q Bᵀ)⁻¹ g: what brings the rays of one point to intersection with
+    the shortest v.
+
+    sigma is equal for the four coordinates of a point, so it cancels.
+    """
+    g, square, gradient = linearised(f, point, use)
+    factor = jnp.where(use, -g / square, 0.0)
+    return tuple(factor * entry for entry in gradient)  # pyright: ignore[reportReturnType]
+
+
+def directions(
+    left: Matrix | None,
+    right: Matrix,
+    point: Point,
+    focal_left: Scalar,
+    focal_right: Scalar,
+):
+    """The rays R1 p1 and R2 p2 (`left` None for R1 = 1)."""
+    x1, y1, x2, y2 = point
+    first = x1, y1, -focal_left
+    return first if left is None else rot.apply(left, first), rot.apply(
+        right, (x2, y2, -focal_right)
+    )
+
+
+def rays(
+    left: Matrix | None,
+    right: Matrix,
+    base: Vector,
+    point: Point,
+    focal_left: Scalar,
+    focal_right: Scalar,
+):
+    """The two `directions`, and how they meet."""
+    first, second = directions(left, right, point, focal_left, focal_right)
+    return first, second, *meeting(first, second, base)
+
+
+def meeting(
+    first: Vector, second: Vector, base: Vector
+) -> tuple[Scalar, Scalar, Scalar]:
+    """w², λ w², μ w² of the closest points λ r1 and b + μ r2 of two rays:
+
+    w = r1 x r2,    λ w² = (b x r2) . w,    μ w² = (b x r1) . w
+    """
+    w = rot.cross(first, second)
+    lam, mu = (rot.dot(rot.cross(base, ray), w) for ray in (second, first))
+    return rot.dot(w, w), lam, mu
+
+
+def depths(
+    first: Vector, second: Vector, base: Vector
+) -> tuple[Scalar, Scalar, Scalar]:
+    """λ w², μ w² and 1 / w²; of parallel rays 0 in place of the last, and the others
+    say on which side they would meet."""
+    squared, lam, mu = meeting(first, second, base)
+    parallel = squared == 0
+    # divided by a safe number, or a point at infinity would leave NaN in every
+    # derivative
+    return lam, mu, jnp.where(parallel, 0.0, 1 / jnp.where(parallel, 1.0, squared))
+
+
+def halfway(
+    first: Vector, second: Vector, base: Vector, lam: Scalar, mu: Scalar
+) -> Vector:
+    """The model point halfway between λ r1 and b + μ r2."""
+    return tuple(
+        (lam * p + b + mu * s) / 2 for p, b, s in zip(first, base, second, strict=True)
+    )  # pyright: ignore

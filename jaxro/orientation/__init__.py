@@ -1,0 +1,1 @@
+"""Relative orientation of one pair, and what its result says of itself."""

@@ -1,0 +1,122 @@
+"""What every start returns."""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, PyTree
+
+from ...adjustment import normal_equations as normal
+from ...adjustment.residuals import Residuals
+from ...geometry import coplanarity
+from ...geometry.elements import AbstractElements, RelativePose, vertical
+from ...geometry.pairs import Pair
+
+LONGEST = 0.5
+"""Longest component of a step towards a start (rad)."""
+
+
+class Begin(NamedTuple):
+    """A pose to begin with, whether another one fits the points as well, and whether a
+    rotation alone explains them."""
+
+    pose: AbstractElements
+    ambiguous: Bool[Array, ""]
+    pure_rotation: Bool[Array, ""]
+
+
+class AbstractStart(eqx.Module):
+    """A way to begin the adjustment of one pair of finite coordinates, whatever its
+    masked points hold."""
+
+    @abc.abstractmethod
+    def __call__(self, pair: Pair) -> Begin:
+        """The pose to begin with."""
+
+
+def distances(pair: Pair, pose: RelativePose) -> Residuals:
+    """Distances of the points from the condition, in the unit of the coordinates,
+    around the pose."""
+    prepare, condition, observations, _ = coplanarity.rigorous(pair)
+    unit = jnp.ones_like(pair.sigma)
+    return Residuals(prepare, condition, pose, observations, unit, pair.mask)
+
+
+class FirstOrder(NamedTuple):
+    """The condition of a pair to first order in the elements of near-vertical photos,
+    for any point.
+
+    With x, y the coordinates over f of the left photo and u, v of the right one, which
+    turns about its own axes,
+
+        g = v - y + (1 + y v) rx - y u ry + u rz - (x v - y u) b1 + (x - u) b2,
+
+    which Dorozhinsky (1971, eq. 5) has for the six standard zones.
+    """
+
+    pair: Pair
+
+    def columns(
+        self, at: tuple[Array, ...]
+    ) -> tuple[list[Array], list[list[Array]], list[Array]]:
+        """g at zero elements, its five slopes, and the weights of the points."""
+        del at
+        pair = self.pair
+        left, right = (
+            1 / pair.focal_left,
+            1 / pair.focal_right,
+        )  # one division each: a point's would cost as much again
+        x, y, u, v = (
+            pair.x_left * left,
+            pair.y_left * left,
+            pair.x_right * right,
+            pair.y_right * right,
+        )
+        slopes = [[1 + y * v], [-y * u], [u], [y * u - x * v], [x - u]]
+        return [v - y], slopes, [jnp.where(pair.mask, 1 / pair.sigma**2, 0.0)]
+
+    def correction(self, x: tuple[Array, ...]) -> tuple[Array, ...]:
+        """What Gauss-Newton subtracts from the elements."""
+        return normal.correction(self.columns(x))
+
+    def further(
+        self, x: tuple[Array, ...], step: tuple[Array, ...]
+    ) -> tuple[Array, ...]:
+        """The elements after a step."""
+        return tuple(a + b for a, b in zip(x, step, strict=True))
+
+
+def approached(pair: Pair, count: int) -> RelativePose:
+    """The pose some Gauss-Newton steps from the vertical, which stays where they fail.
+
+    The first is by the first-order equations, a third of the work; the others are in
+    single precision, which far from the solution is as good.
+    """
+    pose = vertical(pair.focal_left)
+    if count == 0:
+        return pose
+    zero = (jnp.zeros_like(pair.focal_left),) * 5
+    near = _moved(pose, normal.steps(FirstOrder(pair), zero, 1, LONGEST))
+    if count == 1:
+        return near
+    single, points = _with_dtype(jnp.float32, near), _with_dtype(jnp.float32, pair)
+    zero = (jnp.zeros_like(points.focal_left),) * 5
+    return _moved(
+        near, normal.steps(distances(points, single), zero, count - 1, LONGEST)
+    )
+
+
+def _moved(pose: RelativePose, step: tuple[Array, ...]) -> RelativePose:
+    """The pose after a step of any precision, or unchanged where that is not finite."""
+    fine = jnp.isfinite(sum(step))
+    there = pose.moved(_with_dtype(pose.qw.dtype, step)).normalised()
+    return jax.tree.map(lambda new, old: jnp.where(fine, new, old), there, pose)
+
+
+def _with_dtype(dtype, tree: PyTree) -> PyTree:
+    """The tree with its floating-point numbers in another precision."""
+    return jax.tree.map(
+        lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, tree
+    )

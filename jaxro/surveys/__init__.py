@@ -1,0 +1,1 @@
+"""Heights over a grid of squares from parallaxes, and the networks they form."""

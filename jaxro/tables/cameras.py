@@ -1,0 +1,232 @@
+"""Cameras of a table's photos from TOML, in one of three forms:
+
+    [camera]                              one camera for every photo
+    [left] and [right]                    one for all left photos, one for all right ones
+    [photo.NAME], one table a photo       pairs are then named LEFT-RIGHT or LEFT_RIGHT
+
+Each table holds focal and, where they are not the defaults, principal_point = [0, 0],
+pixel_size = 1, y_down = false.
+"""
+
+import re
+import sys
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..geometry.pairs import Camera, Pair
+from .csv import Measurements
+from .fields import TableError, read_text
+
+KEYS = ("focal", "principal_point", "pixel_size", "y_down")
+FORMS = "[camera], or [left] and [right], or [photo.NAME] for every photo"
+
+
+@dataclass
+class Cameras:
+    """The cameras of the left and right photos, or of every photo by its name."""
+
+    file: str
+    left: Camera | None = None
+    right: Camera | None = None
+    photos: dict[str, Camera] = field(default_factory=dict)
+
+    def of(
+        self, name: str, file: str, line: int | str | None = None
+    ) -> tuple[Camera, Camera]:
+        """(left, right) of the pair of this name, that begins at a line of the file.
+        Raises TableError if the name does not say which photos it is made of."""
+        if self.left is not None and self.right is not None:
+            return self.left, self.right
+        splits = [
+            (name[:i], name[i + 1 :]) for i, letter in enumerate(name) if letter in "-_"
+        ]
+        known = [
+            split for split in splits if all(photo in self.photos for photo in split)
+        ]
+        if len(known) != 1:
+            found = (
+                f"{name!r}"
+                if not known
+                else f"{name!r}, which can be split in {len(known)} ways"
+            )
+            expected = (
+                f"LEFT-RIGHT or LEFT_RIGHT with two photos of {self.file}: "
+                f"{', '.join(self.photos)}"
+            )
+            raise TableError(file, line, "pair", found, expected)
+        return self.photos[known[0][0]], self.photos[known[0][1]]
+
+    def of_all(
+        self, names: Any, file: str
+    ) -> tuple[Camera, Camera] | list[tuple[Camera, Camera]]:
+        """(left, right) that all pairs have, or those of each of the names, an Arrow
+        array. Raises TableError."""
+        if self.left is not None and self.right is not None:
+            return self.left, self.right
+        return [self.of(str(name), file) for name in names.to_pylist()]
+
+
+def read(path: Path) -> Cameras:
+    """The cameras of a TOML file. Raises TableError."""
+    text = read_text(path)
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        line = re.search(r"at line (\d+)", str(error))
+        where = int(line[1]) if line else None
+        raise TableError(
+            path, where, None, f"no valid TOML ({error})", f"the tables {FORMS}"
+        ) from None
+    names = set(tables)
+    if names == {"photo"} and isinstance(tables["photo"], dict) and tables["photo"]:
+        return Cameras(
+            str(path),
+            photos={
+                n: _camera(path, text, f"photo.{n}", t)
+                for n, t in tables["photo"].items()
+            },
+        )
+    if names == {"camera"}:
+        one = _camera(path, text, "camera", tables["camera"])
+        return Cameras(str(path), one, one)
+    if names == {"left", "right"}:
+        left, right = (
+            _camera(path, text, side, tables[side]) for side in ("left", "right")
+        )
+        return Cameras(str(path), left, right)
+    found = f"the entries {', '.join(tables)}" if tables else "no entries"
+    raise TableError(path, None, None, found, FORMS)
+
+
+def _camera(path: Path, text: str, table: str, entries: Any) -> Camera:
+    """One camera of its table. Raises TableError for a missing, unknown or unusable
+    key."""
+    if not isinstance(entries, dict):
+        raise TableError(
+            path,
+            None,
+            table,
+            repr(entries),
+            f"a table [{table}] with {', '.join(KEYS)}",
+        )
+    for key, value in entries.items():
+        line, place = _line(text, table, key), f"{table}.{key}"
+        if key not in KEYS:
+            raise TableError(
+                path,
+                line,
+                place,
+                "an unknown key",
+                f"{', '.join(KEYS)}; none is ignored",
+            )
+        good, expected = _fits(key, value)
+        if not good:
+            raise TableError(path, line, place, repr(value), expected)
+    if "focal" not in entries:
+        raise TableError(
+            path,
+            _line(text, table),
+            f"{table}.focal",
+            "no such key",
+            "the focal length in photo units",
+        )
+    x0, y0 = entries.get("principal_point", (0, 0))
+    return Camera(
+        float(entries["focal"]),
+        (float(x0), float(y0)),
+        float(entries.get("pixel_size", 1)),
+        entries.get("y_down", False),
+    )
+
+
+def _fits(key: str, value: Any) -> tuple[bool, str]:
+    """Whether a value suits its key, and what would."""
+    number = lambda v: type(v) in (int, float) and abs(v) <= sys.float_info.max
+    if key == "y_down":
+        return isinstance(value, bool), "true or false"
+    if key == "principal_point":
+        good = isinstance(value, list) and len(value) == 2 and all(map(number, value))
+        return good, "two numbers [x, y] in measured units"
+    return bool(number(value) and value > 0), "a positive number"
+
+
+def _line(text: str, table: str, key: str | None = None) -> int | None:
+    """The line of a key below its [table] header, or of the header itself; None where
+    it is written another way."""
+    inside = False
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = line.split("#")[0].strip()
+        if bare.startswith("["):
+            inside = bare.strip("[] ").replace('"', "").replace("'", "") == table
+            if inside and key is None:
+                return number
+        elif (
+            inside
+            and key is not None
+            and bare.split("=")[0].strip().strip("\"'") == key
+        ):
+            return number
+    return None
+
+
+def check_one_sigma(
+    file: str, line: int | str | None, left: Camera, right: Camera
+) -> None:
+    """Raises TableError where one sigma cannot serve two pixel sizes."""
+    if left.pixel_size != right.pixel_size:
+        found = (
+            f"sigma with pixel sizes {left.pixel_size!r} (left) and "
+            f"{right.pixel_size!r} (right)"
+        )
+        expected = (
+            "coordinates in photo units where the pixel sizes differ, so that one "
+            "sigma serves both photos"
+        )
+        raise TableError(file, line, "sigma", found, expected)
+
+
+def to_pair(
+    measured: Measurements,
+    file: str,
+    left: Camera,
+    right: Camera,
+    sigma: float | None = None,
+) -> Pair:
+    """Measured coordinates as a `Pair` in photo coordinates; sigma for all points or
+    from the table.
+
+    The arithmetic is that of `Camera.to_photo`, in NumPy: tables have pairs of every
+    length, and JAX would compile it for each. Raises TableError where one sigma cannot
+    serve two pixel sizes.
+    """
+    coordinates = []
+    for camera, (u, v) in (
+        (left, measured.coordinates[:2]),
+        (right, measured.coordinates[2:]),
+    ):
+        u0, v0 = camera.principal_point
+        sign = -1.0 if camera.y_down else 1.0
+        coordinates += [
+            (u - u0) * camera.pixel_size,
+            sign * (v - v0) * camera.pixel_size,
+        ]
+    count = len(measured.points)
+    deviation = np.ones(count)
+    if measured.sigma is not None or sigma is not None:
+        deviation = (
+            np.full(count, sigma) if measured.sigma is None else measured.sigma
+        ) * left.pixel_size
+        check_one_sigma(file, measured.lines[0], left, right)
+    fields = (
+        *coordinates,
+        deviation,
+        np.ones(count, bool),
+        np.float64(left.focal),
+        np.float64(right.focal),
+    )
+    return Pair(*jax.device_put(fields))

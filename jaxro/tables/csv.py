@@ -1,0 +1,170 @@
+"""Tables of measured image coordinates: CSV text in, one `Measurements` per pair out,
+or one clear error.
+
+Columns, in any order: point, x_left, y_left, x_right, y_right and optionally pair,
+sigma; `id,xl,yl,xr,yr` is the short form of the first five. Coordinates and sigma are
+in the units of the measurement; cameras turn them into photo coordinates. Nothing is
+skipped or guessed: whatever does not fit stops the reading with file, line and column.
+"""
+
+import io
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from . import fields
+from .fields import Columns, TableError, read_text
+
+COLUMNS = Columns(
+    ("point", "x_left", "y_left", "x_right", "y_right"),
+    ("pair", "sigma"),
+    {"id": "point", "xl": "x_left", "yl": "y_left", "xr": "x_right", "yr": "y_right"},
+)
+NUMBERS = (*COLUMNS.required[1:], "sigma")
+
+
+@dataclass
+class Measurements:
+    """The measured points of one pair; `lines` are their lines in the file."""
+
+    name: str
+    points: list[str] = field(default_factory=list)
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+    lines: list[int] = field(default_factory=list)
+
+    @property
+    def coordinates(self) -> Float[np.ndarray, "4 point"]:
+        """x_left, y_left, x_right, y_right"""
+        return np.asarray(self.rows, np.float64)[:, :4].T
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " point"] | None:
+        """Standard deviations of the coordinates, where the table has them."""
+        return (
+            np.asarray(self.rows, np.float64)[:, 4] if len(self.rows[0]) == 5 else None
+        )
+
+
+@dataclass
+class Table:
+    """All pairs of one file in the order of their first points, and what a careful
+    reader should be told."""
+
+    file: str
+    pairs: list[Measurements]
+    warnings: list[str]
+
+    @property
+    def has_sigma(self) -> bool:
+        """True where the table has a column sigma."""
+        return self.pairs[0].sigma is not None
+
+
+def read(path: Path) -> Table:
+    """The pairs of a CSV file; without a column `pair` one pair, named after the file.
+    Raises TableError."""
+    return parse(read_text(path), str(path), path.stem)
+
+
+def parse(text: str, file: str, name: str) -> Table:
+    """The pairs of CSV text. `file` is named in errors, `name` is the pair's where the
+    table has no column `pair`."""
+    line = 1
+    pairs: dict[str, Measurements] = {}
+    seen: dict[str, dict[str, int]] = {}
+    places: dict[tuple, str] = {}
+    twins: dict[str, list[str]] = {}
+    for line, pair, point, values in checked(io.StringIO(text, newline=""), file, name):
+        first = seen.setdefault(pair, {}).setdefault(point, line)
+        if first != line:
+            found = f"{point!r} a second time in pair {pair!r} (first on line {first})"
+            raise TableError(
+                file,
+                line,
+                "point",
+                found,
+                "each point once in a pair; rename it or delete one of the two",
+            )
+        twin = places.setdefault((pair, *values[:4]), point)
+        if twin != point:
+            twins.setdefault(pair, []).append(f"{point} = {twin} (line {line})")
+        measured = pairs.setdefault(pair, Measurements(pair))
+        measured.points.append(point)
+        measured.rows.append(values)
+        measured.lines.append(line)
+    if not pairs:
+        raise no_points(file, line)
+    return Table(
+        file,
+        list(pairs.values()),
+        [_twins(file, pair, found) for pair, found in twins.items()],
+    )
+
+
+def no_points(file: str, line: int) -> TableError:
+    """There is nothing below this line."""
+    return TableError(
+        file,
+        line + 1,
+        None,
+        "no points",
+        "one line for every measured point below the header",
+    )
+
+
+def lines(path: Path) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
+    """The `checked` lines of a file, one at a time. Raises TableError."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            yield from checked(file, str(path))
+    except (OSError, UnicodeDecodeError):
+        read_text(path)  # says which
+
+
+def checked(
+    text: Iterable[str], file: str, name: str = ""
+) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
+    """(line number, pair, point, numbers) of every line below the header, each field
+    looked at. Raises TableError."""
+    for line, cells in fields.lines_of(text, file, COLUMNS):
+        point = fields.name(cells["point"], file, line, "point")
+        pair = (
+            fields.name(cells["pair"], file, line, "pair") if "pair" in cells else name
+        )
+        numbers = (c for c in NUMBERS if c in cells)
+        yield (
+            line,
+            pair,
+            point,
+            tuple(_number(cells[c], file, line, c) for c in numbers),
+        )
+
+
+def _twins(file: str, pair: str, found: list[str]) -> str:
+    named = ", ".join(found[:5]) + (
+        f" and {len(found) - 5} more" if len(found) > 5 else ""
+    )
+    return (
+        f"{file}: in pair {pair!r} the coordinates of a point occur again under "
+        f"another name: {named}. "
+        "Each counts in the degrees of freedom; delete what was measured only once."
+    )
+
+
+def _number(text: str, file: str, line: int, column: str) -> float:
+    """A finite number; positive for sigma."""
+    value = fields.number(
+        text, file, line, column, "; delete the line to leave the point out"
+    )
+    if column == "sigma" and value <= 0:
+        raise TableError(
+            file,
+            line,
+            column,
+            repr(text),
+            "a positive standard deviation in the unit of the coordinates",
+        )
+    return value

@@ -1,0 +1,189 @@
+"""CSV text field by field, and the one error of everything that is read: file, line,
+column, what was found there, what was expected. Nothing is skipped or guessed."""
+
+import csv
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+class TableError(ValueError):
+    """Input that cannot be used: where it is (`line`: its number, or "row 5"), what was
+    found there, what was expected."""
+
+    def __init__(
+        self,
+        file: str | Path,
+        line: int | str | None,
+        column: str | None,
+        found: str,
+        expected: str,
+    ):
+        self.file, self.line, self.column, self.found, self.expected = (
+            str(file),
+            line,
+            column,
+            found,
+            expected,
+        )
+        place = [self.file]
+        if line is not None:
+            place.append(line if isinstance(line, str) else f"line {line}")
+        if column is not None:
+            place.append(f"column {column}")
+        super().__init__(f"{', '.join(place)}: found {found}; expected {expected}")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of a kind of table, in any order and any case; `short`: other names
+    of some."""
+
+    required: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+    short: Mapping[str, str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        short = f" (or {','.join(self.short)})" if self.short else ""
+        optional = f", optionally {', '.join(self.optional)}" if self.optional else ""
+        return f"the columns {','.join(self.required)}{short}{optional}"
+
+    def full(self, given: str) -> str:
+        """The name of a column as it is written here."""
+        name = given.strip().lower()
+        return self.short.get(name, name)
+
+    def places(self, header: list[str], file: str, line: int | None) -> dict[str, int]:
+        """The place of every column by its full name. Raises TableError."""
+        if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+            expected = "fields separated by commas, decimals by points"
+            raise TableError(file, line, None, f"the header {header[0]!r}", expected)
+        places: dict[str, int] = {}
+        for place, entry in enumerate(header):
+            given, full = entry.strip().lower(), self.full(entry)
+            if full not in self.required + self.optional:
+                what = (
+                    f"an unknown column {entry!r}"
+                    if given
+                    else f"no name in field {place + 1} of the header"
+                )
+                raise TableError(
+                    file,
+                    line,
+                    given or None,
+                    what,
+                    f"{self}; delete or rename it, none is ignored",
+                )
+            if full in places:
+                found = "this column a second time"
+                raise TableError(
+                    file, line, given, found, "each column once; delete one of the two"
+                )
+            places[full] = place
+        for name in self.required:
+            if name not in places:
+                raise TableError(file, line, name, "no such column", str(self))
+        return places
+
+
+def read_text(path: Path) -> str:
+    """The UTF-8 text of a file. Raises TableError if it cannot be read or is not
+    UTF-8."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        expected = "a readable file; check the path and its permissions"
+        raise TableError(
+            path,
+            None,
+            None,
+            f"no file that can be read ({error.strerror or error})",
+            expected,
+        ) from None
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        found = f"the byte 0x{data[error.start]:02x}"
+        raise TableError(
+            path, line, None, found, "UTF-8 text; save the table as CSV UTF-8"
+        ) from None
+
+
+def lines_of(
+    text: Iterable[str], file: str, columns: Columns
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """(line number, fields by the full names of their columns) of every line that is
+    not blank. Raises TableError."""
+    rows = _rows(text, file)
+    line, header = next(rows, (1, None))
+    if header is None:
+        raise TableError(
+            file, 1, None, "no text at all", f"a header line with {columns}"
+        )
+    places = columns.places(header, file, line)
+    for line, row in rows:
+        if len(row) < len(places):
+            missing = next(name for name, place in places.items() if place == len(row))
+            raise TableError(
+                file,
+                line,
+                missing,
+                f"{len(row)} fields",
+                f"{len(places)}, as in the header",
+            )
+        if len(row) > len(places):
+            expected = (
+                f"{len(places)}, as in the header; decimals are written with a point, "
+                "names with commas in quotes"
+            )
+            raise TableError(file, line, None, f"{len(row)} fields", expected)
+        yield line, {name: row[place].strip() for name, place in places.items()}
+
+
+def name(text: str, file: str, line: int, column: str) -> str:
+    """A name. Raises TableError if it is empty."""
+    if not text:
+        raise TableError(
+            file, line, column, "an empty field", f"the name of the {column}"
+        )
+    return text
+
+
+def number(text: str, file: str, line: int, column: str, advice: str = "") -> float:
+    """A finite number. Raises TableError, with the advice."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = None
+    if (
+        value is None or "_" in text
+    ):  # Python reads 1_0 as 10; a measuring table does not
+        raise TableError(
+            file,
+            line,
+            column,
+            repr(text) if text else "an empty field",
+            f"a number such as -12.345{advice}",
+        )
+    if not math.isfinite(value):
+        raise TableError(file, line, column, repr(text), f"a finite number{advice}")
+    return value
+
+
+def _rows(text: Iterable[str], file: str) -> Iterator[tuple[int, list[str]]]:
+    """(line number, fields) of every line that is not blank."""
+    reader = csv.reader(text, strict=True, skipinitialspace=True)
+    while True:
+        try:
+            row = next(reader)
+        except StopIteration:
+            return
+        except csv.Error as error:
+            expected = "comma-separated fields, each quotation closed on its line"
+            raise TableError(
+                file, reader.line_num, None, str(error), expected
+            ) from None
+        if any(entry.strip() for entry in row):
+            yield reader.line_num, row

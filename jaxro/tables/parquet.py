@@ -1,0 +1,330 @@
+"""Tables of any size: measured coordinates from Parquet, part by part; CSV text made
+Parquet first.
+
+Columns are those of `tables`. The rows of a pair stand one behind the other. Names may
+be text or whole numbers. A coordinate that is missing or not finite makes its pair
+`non_finite_input`, and harms no other.
+"""
+
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..batches.ragged import Ragged
+from ..geometry.pairs import Camera
+from . import csv as tables
+from .csv import COLUMNS
+from .fields import TableError
+
+try:
+    import pyarrow as pa
+    import pyarrow.compute as pc
+    import pyarrow.parquet as pq
+except ModuleNotFoundError:
+    raise SystemExit(
+        "Parquet tables need pyarrow: pip install 'jaxro[cli,tables]'"
+    ) from None
+
+NAMES = ("pair", "point")
+
+BATCH = 1 << 18
+"""Rows decoded at once."""
+
+
+class Scan(NamedTuple):
+    """Where the pairs of a table begin, with the end of the table behind them, and
+    their names, an Arrow array."""
+
+    begins: Int[np.ndarray, " pairs+1"]
+    names: Any
+
+    @property
+    def lengths(self) -> Int[np.ndarray, " pair"]:
+        """Points of every pair."""
+        return np.diff(self.begins)
+
+
+class Source:
+    """A Parquet table of measured points. Raises TableError where it is none."""
+
+    def __init__(self, path: Path, told: Path | None = None):
+        self.path = told or path  # as it is told of: a CSV table has been converted
+        self._converted = self.path != path
+        try:
+            self._file = pq.ParquetFile(path, pre_buffer=False)
+        except (OSError, pa.ArrowInvalid) as error:
+            found = f"no Parquet file that can be read ({str(error).splitlines()[0]})"
+            raise TableError(
+                path, None, None, found, "a Parquet table of measured points"
+            ) from None
+        self.columns = _columns(path, self._file.schema_arrow)
+        self._position, self._batches = -1, iter(())
+        self._left: Any = None
+
+    @property
+    def has_sigma(self) -> bool:
+        """Whether the table has a column sigma."""
+        return "sigma" in self.columns
+
+    @property
+    def count(self) -> int:
+        """Rows of the table."""
+        return self._file.metadata.num_rows
+
+    def scan(self) -> Scan:
+        """Where the pairs begin: reads the column `pair` alone. Raises TableError where
+        a pair comes in two parts."""
+        if not self.count:
+            raise TableError(
+                self.path, None, None, "no points", "one row for every measured point"
+            )
+        for name in NAMES:
+            self._complete(name)
+        if "pair" not in self.columns:
+            return Scan(np.array([0, self.count]), pa.chunked_array([[self.path.stem]]))
+        begins, names, row, last = [], [], 0, None
+        for batch in self._file.iter_batches(BATCH, columns=[self.columns["pair"]]):
+            column = batch.column(0)
+            starts = _runs(column, last)
+            begins.append(starts + row)
+            names.append(column.take(starts))
+            row, last = row + len(column), column[-1].as_py()
+        found = np.concatenate(begins)
+        every = pa.chunked_array(names)
+        self._once(every, found)
+        return Scan(np.append(found, row), every)
+
+    def _complete(self, full: str) -> None:
+        """Raises TableError for a row without a name; reads the column only where the
+        file does not tell."""
+        if full not in self.columns:
+            return
+        known, place = (
+            self._file.metadata,
+            self._file.schema_arrow.get_field_index(self.columns[full]),
+        )
+        groups = [
+            known.row_group(k).column(place).statistics
+            for k in range(known.num_row_groups)
+        ]
+        if all(map(_named, groups)):
+            return
+        row = 0
+        for batch in self._file.iter_batches(BATCH, columns=[self.columns[full]]):
+            names = batch.column(0).cast(pa.string())
+            trimmed = pc.utf8_trim_whitespace(names)  # pyright: ignore[reportAttributeAccessIssue]
+            blank = pc.equal(trimmed, "").fill_null(True)  # pyright: ignore[reportAttributeAccessIssue]
+            if pc.any(blank).as_py():  # pyright: ignore[reportAttributeAccessIssue]
+                row += int(np.flatnonzero(blank.to_numpy(zero_copy_only=False))[0])
+                raise TableError(
+                    self.path,
+                    None,
+                    full,
+                    f"nothing in {self.place(row)}",
+                    f"the name of the {full}",
+                )
+            row += len(blank)
+
+    def _once(self, names: Any, begins: np.ndarray) -> None:
+        if len(names.unique()) == len(names):
+            return
+        seen: set = set()
+        for name, row in zip(names.to_pylist(), begins, strict=True):
+            if name in seen:
+                found = (
+                    f"pair {name!r} again in {self.place(int(row))}, after other pairs"
+                )
+                raise TableError(
+                    self.path,
+                    None,
+                    "pair",
+                    found,
+                    "the rows of a pair one behind the other: sort the table",
+                )
+            seen.add(name)
+
+    def place(self, row: int) -> str:
+        """How a row is told of: by its line where the table has been converted."""
+        if not self._converted:
+            return f"row {row + 1}"
+        line, *_ = next(islice(tables.lines(self.path), row, None))
+        return f"line {line}"
+
+    def rows(self, begin: int, end: int) -> Any:
+        """These rows as an Arrow table with the full names of the columns; one behind
+        the other is read only once."""
+        if begin != self._position:
+            self._seek(begin)
+        taken, wanted = [], end - begin
+        while wanted:
+            piece = self._left if self._left is not None else next(self._batches)
+            part = piece.slice(0, wanted)
+            self._left = piece.slice(len(part)) if len(part) < len(piece) else None
+            taken.append(part)
+            wanted -= len(part)
+        self._position = end
+        table = pa.Table.from_batches(taken)
+        return table.rename_columns([COLUMNS.full(name) for name in table.column_names])
+
+    def _seek(self, row: int) -> None:
+        """The next batch begins with this row."""
+        group, before = 0, 0
+        while before + self._file.metadata.row_group(group).num_rows <= row:
+            before += self._file.metadata.row_group(group).num_rows
+            group += 1
+        groups = list(range(group, self._file.metadata.num_row_groups))
+        self._batches = self._file.iter_batches(
+            BATCH, row_groups=groups, columns=list(self.columns.values())
+        )
+        self._left, skip = None, row - before
+        while skip:
+            piece = next(self._batches)
+            self._left = piece.slice(skip) if skip < len(piece) else None
+            skip -= min(skip, len(piece))
+
+
+def _named(told: Any) -> bool:
+    """Whether the statistics of a column say that no value is missing and no text
+    begins with a blank."""
+    if (
+        told is None
+        or not told.has_null_count
+        or told.null_count
+        or not told.has_min_max
+    ):
+        return False
+    return not isinstance(told.min, str) or told.min[:1] > " "
+
+
+def _columns(path: Path, schema: Any) -> dict[str, str]:
+    """The columns in the table by their full names. Raises TableError for missing,
+    unknown or unsuitable ones."""
+    places = COLUMNS.places(schema.names, str(path), None)
+    for full, place in places.items():
+        field = schema.field(place)
+        named = full in NAMES
+        t = field.type.value_type if pa.types.is_dictionary(field.type) else field.type
+        text = pa.types.is_string(t) or pa.types.is_large_string(t)
+        good = (
+            text or pa.types.is_integer(t)
+            if named
+            else pa.types.is_floating(t) or pa.types.is_integer(t)
+        )
+        if not good:
+            expected = "text or whole numbers" if named else "numbers"
+            raise TableError(
+                path, None, field.name, f"values of type {field.type}", expected
+            )
+    return {full: schema.names[place] for full, place in places.items()}
+
+
+def _runs(column: Any, last: Any) -> np.ndarray:
+    """Where another value begins; `last`: the value before the first."""
+    codes = (
+        column.dictionary_encode().indices.to_numpy()
+        if not pa.types.is_dictionary(column.type)
+        else None
+    )
+    codes = column.indices.to_numpy() if codes is None else codes
+    starts = np.flatnonzero(np.diff(codes)) + 1
+    return (
+        starts
+        if last is not None and column[0].as_py() == last
+        else np.concatenate([[0], starts])
+    )
+
+
+def names(table: Any, starts: np.ndarray, file: str) -> Any:
+    """The name of each pair of a part, as an Arrow array; of a table without a column
+    `pair` that of the file."""
+    if "pair" not in table.column_names:
+        return pa.array([Path(file).stem] * len(starts))
+    return table.column("pair").take(pa.array(starts)).combine_chunks()
+
+
+def owners(begins: np.ndarray) -> Any:
+    """Of every row of a part the number of its pair."""
+    return pa.array(np.repeat(np.arange(len(begins) - 1), np.diff(begins)))
+
+
+def twice(table: Any, begins: np.ndarray) -> np.ndarray:
+    """The pairs of a part that have two points of one name."""
+    codes = table.column("point").combine_chunks()
+    codes = codes if pa.types.is_dictionary(codes.type) else codes.dictionary_encode()
+    codes = codes.indices.to_numpy(zero_copy_only=False).astype(np.int64)
+    rising = np.diff(codes) > 0
+    rising[begins[1:-1] - 1] = True
+    if np.all(rising):  # the names come in one order in every pair: none can come twice
+        return np.zeros(0, int)
+    key = np.sort(owners(begins).to_numpy() * (int(codes.max()) + 1) + codes)
+    return np.unique(key[1:][np.diff(key) == 0] // (int(codes.max()) + 1))
+
+
+def ragged(
+    table: Any,
+    begins: np.ndarray,
+    cameras: tuple[Camera, Camera] | list[tuple[Camera, Camera]],
+    sigma: float | None,
+) -> Ragged:
+    """The points of a part in photo coordinates; cameras for all pairs, or of each.
+    Missing numbers are NaN."""
+    numbers = lambda name: np.asarray(
+        table.column(name).cast(pa.float64(), safe=False).to_numpy(), np.float64
+    )
+    each = lambda side, value: _spread(cameras, side, value, begins)
+    photo = []
+    for side, (u, v) in enumerate((("x_left", "y_left"), ("x_right", "y_right"))):
+        size = each(side, lambda c: c.pixel_size)
+        sign = each(side, lambda c: -1.0 if c.y_down else 1.0)
+        photo.append((numbers(u) - each(side, lambda c: c.principal_point[0])) * size)
+        photo.append(
+            (numbers(v) - each(side, lambda c: c.principal_point[1])) * (sign * size)
+        )
+    count = len(table)
+    given = (
+        numbers("sigma")
+        if "sigma" in table.column_names
+        else None
+        if sigma is None
+        else np.full(count, sigma)
+    )
+    deviation = (
+        np.ones(count) if given is None else given * each(0, lambda c: c.pixel_size)
+    )
+    pairs = len(begins) - 1
+    focals = [
+        np.full(pairs, cameras[side].focal)
+        if isinstance(cameras, tuple)
+        else np.array([both[side].focal for both in cameras])
+        for side in (0, 1)
+    ]
+    return Ragged(begins, *photo, deviation, np.ones(count, bool), *focals)
+
+
+def _spread(
+    cameras: Any, side: int, value: Any, begins: np.ndarray
+) -> Float[np.ndarray, "..."]:
+    """A constant of the cameras, for all rows or for each."""
+    if isinstance(cameras, tuple):
+        return np.asarray(value(cameras[side]))
+    return np.repeat(
+        np.array([value(both[side]) for both in cameras], np.float64), np.diff(begins)
+    )
+
+
+def write(table: Any, path: Path) -> None:
+    """The table as a Parquet file."""
+    pq.write_table(table, path, **encoding(table.schema))
+
+
+def encoding(schema: Any) -> dict[str, Any]:
+    """How tables are written: only names are worth a dictionary."""
+    repeated = [
+        f.name
+        for f in schema
+        if not (pa.types.is_floating(f.type) or pa.types.is_boolean(f.type))
+    ]
+    return {"use_dictionary": repeated, "compression": "snappy"}

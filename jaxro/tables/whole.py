@@ -1,0 +1,126 @@
+"""Whole files or none: where a result may be written, and writing it there."""
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from .fields import TableError
+
+
+def is_parquet(file: Path) -> bool:
+    """Whether the name of a file says that it is a Parquet table."""
+    return file.suffix.lower() in (".parquet", ".pq")
+
+
+def check_target(directory: Path, force: bool) -> None:
+    """Raises TableError unless a result may be written there."""
+    check_name(directory, "a name for the folder of results")
+    if directory.exists() and not directory.is_dir():
+        raise TableError(
+            directory, None, None, "a file", "the name of a folder for the results"
+        )
+    if not force and directory.exists() and any(directory.iterdir()):
+        raise TableError(
+            directory,
+            None,
+            None,
+            "a folder that is not empty",
+            "a new folder, or --force to overwrite",
+        )
+
+
+def check_file(path: Path, force: bool) -> None:
+    """Raises TableError unless a single result may be written there."""
+    check_name(path, "a name for the file of the result")
+    if path.is_dir():
+        raise TableError(
+            path, None, None, "a folder", "the name of a file for the result"
+        )
+    if not force and path.exists():
+        raise TableError(
+            path,
+            None,
+            None,
+            "a file that exists",
+            "a new name, or --force to overwrite",
+        )
+
+
+def check_name(path: Path, expected: str) -> None:
+    """Raises TableError where the disk knows no such name, or none for a draft beside
+    it."""
+    whole = path.resolve()
+    if not whole.name:
+        raise TableError(path, None, None, "the root of all folders", expected)
+    try:
+        whole.with_name(f".{whole.name}.{os.getpid()}.unfinished.old").lstat()
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise TableError(
+            path, None, None, error.strerror or str(error), expected
+        ) from None
+
+
+def write(
+    directory: Path, texts: Mapping[str, str | bytes], read: Sequence[Path | None] = ()
+) -> None:
+    """All files by name, first complete in a folder beside `directory`, then renamed
+    into place.
+
+    Raises TableError, with nothing written, where the disk refuses, or one would take
+    the place of a file that was `read`.
+    """
+    for file in read:
+        if file is not None and file.resolve() in [
+            (directory / name).resolve() for name in texts
+        ]:
+            raise TableError(
+                file,
+                None,
+                None,
+                "a table to be read where a result is to be written",
+                "another --out",
+            )
+    draft = directory.absolute().with_name(
+        f".{directory.absolute().name}.{os.getpid()}.partial"
+    )
+    try:
+        draft.mkdir(parents=True)
+        for name, text in texts.items():
+            (draft / name).write_bytes(
+                text if isinstance(text, bytes) else text.encode()
+            )
+        if directory.exists():
+            for name in texts:
+                os.replace(draft / name, directory / name)
+        else:
+            os.replace(draft, directory)
+    except OSError as error:
+        raise TableError(
+            directory,
+            None,
+            None,
+            error.strerror or str(error),
+            "a folder that can be written",
+        ) from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def write_file(path: Path, text: str) -> None:
+    """The whole file or none. Raises TableError."""
+    draft = path.absolute().with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        draft.parent.mkdir(parents=True, exist_ok=True)
+        draft.write_text(text, encoding="utf-8", newline="")
+        os.replace(draft, path)
+    except OSError as error:
+        raise TableError(
+            path, None, None, error.strerror or str(error), "a file that can be written"
+        ) from None
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""The seam to the compiler: what makes the same numbers sooner."""

@@ -1,0 +1,256 @@
+"""A compiled program over many pairs: slabs of one size, spread over threads and
+devices.
+
+XLA releases the interpreter lock and runs a slab on one core; no program that goes
+through here may call LAPACK, which would wait for itself for ever.
+"""
+
+import math
+import os
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from . import memory
+from .programs import Program
+
+SLAB_POINTS = 1 << 16
+"""Points per call of the compiled program: long enough to hide the call, short enough
+that a result is still in the cache when it is put to its place, its memory is used
+again for the next, and progress is seen."""
+
+
+ALIGNMENT = 64
+"""Bytes to which JAX wants memory that it takes over without a copy."""
+
+
+class Way(NamedTuple):
+    """How pairs go through. None picks a good value: of threads (all cores), pairs per
+    chunk (by the number of points) and pairs per call of the program, `slab` (by the
+    number of pairs; if given, every call has this shape). `calls`: at least so many per
+    core, so that no thread waits long for the last one (0: a single call if possible).
+    The results are the same bits with any number of threads."""
+
+    threads: int | None = None
+    chunk: int | None = None
+    slab: int | None = None
+    calls: int = 2
+
+
+Report = Callable[[int, int], None]
+
+
+def unheard(done: int, total: int) -> None:
+    """Progress that nobody asked for."""
+
+
+def spread(
+    data: PyTree, run: Program, way: Way, chunk: int, report: Report = unheard
+) -> PyTree:
+    """run(data) of everything on the leading axis, slab by slab, as NumPy arrays;
+    `chunk` divides a slab.
+
+    The last slab is filled up with empty pairs (zeros, mask False). `report` is called
+    from the calling thread. If `way.slab` is given, the arrays are writable. Raises
+    ValueError for a chunk or number of threads below one.
+    """
+    if chunk < 1 or (way.threads is not None and way.threads < 1):
+        raise ValueError(
+            f"threads and chunk must be positive (or None), got {way.threads} and "
+            f"{chunk}"
+        )
+    leaves = jax.tree.leaves(data)
+    total, points = leaves[0].shape[0], math.prod(leaves[0].shape[1:])
+    devices = (
+        jax.local_devices()
+    )  # several GPUs take turns; a CPU is one, whose cores are the threads
+    cores = _workers()
+    if way.slab is not None:
+        size = -(-way.slab // chunk) * chunk
+    elif total <= chunk:
+        size = min(1 << max(total - 1, 0).bit_length(), chunk)
+    else:
+        most = max(1, SLAB_POINTS // (chunk * max(points, 1)))
+        calls = max(way.calls * cores, -(-total // (most * chunk)), 1)
+        calls = (
+            -(-calls // cores) * cores if calls > 1 else 1
+        )  # so that no core waits for the last call
+        size = chunk * min(most, _rounded(-(-total // (calls * chunk))))
+    begins = range(0, total, size)
+
+    def part(begin: int) -> PyTree:
+        slab = _filled(jax.tree.map(lambda a: a[begin : begin + size], data), size)
+        if len(devices) == 1:
+            return run(slab)
+        with jax.default_device(devices[begin // size % len(devices)]):
+            return run(slab)
+
+    if (
+        way.slab is None and total <= size
+    ):  # nothing to put together: the program's own arrays, read-only
+        out = jax.tree.map(lambda a: np.asarray(a)[:total], part(0))
+        report(total, total)
+        return out
+    shape = (size, points, leaves[0].dtype)
+    first = None
+    if (
+        shape not in run.outputs
+    ):  # one call alone compiles; the threads then find the program ready
+        first = part(0)
+        run.outputs[shape] = jax.tree.map(
+            lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), first
+        )
+    out = _room(
+        jax.tree.map(
+            lambda a: jax.ShapeDtypeStruct((total, *a.shape[1:]), a.dtype),
+            run.outputs[shape],
+        )
+    )
+
+    def work(begin: int) -> int:
+        result = part(begin) if first is None or begin else first
+        end = min(begin + size, total)
+        for target, source in zip(
+            jax.tree.leaves(out), jax.tree.leaves(result), strict=True
+        ):
+            target[begin:end] = np.asarray(source)[: end - begin]
+        return end - begin
+
+    _shared(
+        work,
+        begins,
+        min(way.threads or cores, len(begins)) - 1,
+        lambda done: report(done, total),
+    )
+    report(total, total)
+    return out
+
+
+def _shared(
+    work: Callable[[int], int],
+    begins: Iterable[int],
+    helpers: int,
+    heard: Callable[[int], None],
+) -> None:
+    """work(begin) of every slab by the calling thread and `helpers` others, each taking
+    the next when it is free; what is done is `heard` in the calling thread. After an
+    error or an interrupt nobody begins another."""
+    left, done = deque(begins), []
+
+    def taken() -> int | None:
+        try:
+            return left.popleft()
+        except IndexError:  # asked first, another thread could be quicker
+            return None
+
+    def go(heard: Callable[[int], None]) -> None:
+        try:
+            while (begin := taken()) is not None:
+                done.append(work(begin))
+                if left:
+                    heard(sum(done))
+        finally:
+            left.clear()
+
+    others = [_pool().submit(go, lambda done: None) for _ in range(helpers)]
+    try:
+        go(heard)
+    finally:
+        others = [
+            other for other in others if not other.cancel()
+        ]  # who has not begun by now has nothing to do
+        wait(others)
+    for other in others:
+        other.result()
+
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    """Threads that help; they wait for the next call, since to begin one takes as long
+    as a hundred pairs."""
+    return ThreadPoolExecutor(_workers(), "jaxro")
+
+
+def _workers() -> int:
+    """Threads that keep every core and every device busy."""
+    return max(_cores(), 2 * jax.local_device_count())
+
+
+def chunked(one: Callable, data: PyTree, chunk: int) -> PyTree:
+    """`one` of everything on the leading axis, `chunk` at a time, which is a working
+    set that stays in the cache and, where `one` is a loop, how many wait for the last
+    of them."""
+    count = jax.tree.leaves(data)[0].shape[0]
+    if count == 1:  # without batching, which traces every loop several times
+        return jax.tree.map(
+            lambda a: jnp.asarray(a)[None], one(jax.tree.map(lambda a: a[0], data))
+        )
+    if count <= chunk:
+        return jax.vmap(one)(data)
+    if chunk == 1:
+        return jax.lax.map(one, data)
+    split = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), data)
+    return jax.tree.map(
+        lambda a: a.reshape(-1, *a.shape[2:]), jax.lax.map(jax.vmap(one), split)
+    )
+
+
+def _cores() -> int:
+    """The cores that this process may use; all of the machine where the system does not
+    tell."""
+    return (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
+
+
+def _filled(slab: PyTree, size: int) -> PyTree:
+    """The slab with zeros (mask False: empty pairs) up to `size` rows."""
+    rows = jax.tree.leaves(slab)[0].shape[0]
+    if rows == size:
+        return slab
+    filled = _room(
+        jax.tree.map(
+            lambda a: jax.ShapeDtypeStruct((size, *a.shape[1:]), a.dtype), slab
+        )
+    )
+    for target, source in zip(
+        jax.tree.leaves(filled), jax.tree.leaves(slab), strict=True
+    ):
+        target[:rows], target[rows:] = source, 0
+    return filled
+
+
+def _rounded(chunks: int) -> int:
+    """Rounded up to four to seven times a power of two: few sizes, since each is
+    another program."""
+    step = 1 << max(chunks.bit_length() - 3, 0)
+    return -(-chunks // step) * step
+
+
+def _room(shapes: PyTree) -> PyTree:
+    """Memory for a slab or a result, aligned as JAX wants it, all in one piece, for
+    which the system gives large pages: each is zeroed at its first use, and the small
+    ones of many pieces cost a fifth of a large result."""
+    leaves, structure = jax.tree.flatten(shapes)
+    sizes = [
+        -(-math.prod(leaf.shape) * leaf.dtype.itemsize // ALIGNMENT) * ALIGNMENT
+        for leaf in leaves
+    ]
+    room = memory.RESULTS.room(sum(sizes) + ALIGNMENT)
+    ends = np.cumsum(sizes) + -room.ctypes.data % ALIGNMENT
+    parts = [
+        room[end - size :][: math.prod(leaf.shape) * leaf.dtype.itemsize]
+        .view(leaf.dtype)
+        .reshape(leaf.shape)
+        for leaf, size, end in zip(leaves, sizes, ends, strict=True)
+    ]
+    return jax.tree.unflatten(structure, parts)

@@ -1,0 +1,419 @@
+"""Several kinds of conditions between many blocks of parameters, against dense normal
+equations in plain NumPy."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxro
+from jaxro import losses
+from jaxro.adjustment import RESULTS, Term, adjust, symmetric
+
+# -------------------------------------------------------------------------------------
+# a levelling net
+
+NODES = 300
+
+
+@pytest.fixture(scope="module")
+def net():
+    """Legs of a chain of nodes and of many ties: start, end, variance, rise."""
+    rng = np.random.default_rng(0)
+    start = np.concatenate([np.arange(NODES - 1), rng.integers(0, NODES, 600)])
+    end = np.concatenate([np.arange(1, NODES), rng.integers(0, NODES, 600)])
+    apart = start != end
+    start, end = start[apart], end[apart]
+    variance, height = rng.uniform(0.5, 2, len(start)), rng.normal(size=NODES)
+    return (
+        start,
+        end,
+        variance,
+        height[end] - height[start] + rng.normal(size=len(start)) * np.sqrt(variance),
+    )
+
+
+def legs(net, mask=None):
+    start, end, variance, rise = net
+    return Term(
+        lambda a, b, rise: b - a - rise,
+        rise,
+        variance,
+        [("height", start), ("height", end)],
+        mask,
+    )
+
+
+KNOWN = Term(
+    lambda height, known: height - known,
+    np.array([1.5]),
+    0.01,
+    [("height", np.array([0]))],
+)
+solve = eqx.filter_jit(lambda term: adjust([term, KNOWN], {"height": jnp.zeros(NODES)}))
+
+
+def dense(net):
+    """The matrix of all legs and of the known height, the weights and what is
+    measured."""
+    start, end, variance, rise = net
+    a = np.zeros((len(start) + 1, NODES))
+    a[np.arange(len(start)), end] = 1
+    a[np.arange(len(start)), start] -= 1
+    a[-1, 0] = 1
+    return a, np.append(1 / variance, 100.0), np.append(rise, 1.5)
+
+
+def test_three_hundred_heights_from_two_threads(net):
+    a, w, measured = dense(net)
+    n = a.T @ (w[:, None] * a)
+    q = np.linalg.inv(n)
+    heights = q @ (a.T @ (w * measured))
+    v = a @ heights - measured
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(lambda _: solve(legs(net)), range(8)))
+    for found in both:
+        assert found.result == RESULTS.successful
+        np.testing.assert_allclose(found.parameters["height"], heights, atol=1e-12)
+        np.testing.assert_allclose(found.cofactor, q, atol=1e-12)
+        np.testing.assert_allclose(
+            found.covariance("height", 1.0)[:, 0, 0], np.diag(q), atol=1e-12
+        )
+        redundancy = 1 - np.einsum("gi,ij,gj->g", a, q, a) * w
+        np.testing.assert_allclose(
+            np.concatenate([r[:, 0] for r in found.redundancy]), redundancy, atol=1e-11
+        )
+        np.testing.assert_allclose(
+            found.sigma0**2, np.sum(w * v**2) / (len(w) - NODES), rtol=1e-11
+        )
+        assert found.degrees_of_freedom == len(w) - NODES
+
+
+def test_a_net_without_a_known_height_needs_a_constraint(net):
+    """Its mean as datum gives the pseudoinverse; without one that is told."""
+    start = {"height": jnp.zeros(NODES)}
+    a, w, measured = (entry[:-1] for entry in dense(net))
+    q = np.linalg.pinv(a.T @ (w[:, None] * a))
+    found = eqx.filter_jit(
+        lambda term: adjust([term], start, constraints=lambda p: jnp.sum(p["height"]))
+    )(legs(net))
+    np.testing.assert_allclose(
+        found.parameters["height"], q @ (a.T @ (w * measured)), atol=1e-11
+    )
+    np.testing.assert_allclose(found.cofactor, q, atol=1e-11)
+    assert (
+        found.result == RESULTS.successful
+        and found.degrees_of_freedom == len(w) - NODES + 1
+    )
+    assert adjust(legs(net), start).result == RESULTS.rank_deficient
+
+
+def test_masked_groups_do_not_count_and_a_loss_fades_outliers(net):
+    start, end, variance, rise = net
+    use = np.arange(len(rise)) % 7 > 0
+    part = solve(legs((start, end, variance, np.where(use, rise, 1e3)), use))
+    left = eqx.filter_jit(
+        lambda term: adjust([term, KNOWN], {"height": jnp.zeros(NODES)})
+    )(legs(tuple(column[use] for column in net)))
+    np.testing.assert_allclose(
+        part.parameters["height"], left.parameters["height"], atol=1e-11
+    )
+    np.testing.assert_allclose(part.sigma0, left.sigma0, rtol=1e-11)
+    loss = losses.Huber()
+    robust = lambda term: adjust(
+        [term, KNOWN], {"height": jnp.zeros(NODES)}, loss=loss, max_steps=200
+    )
+    wrong = rise.copy()
+    wrong[400] += 1000.0
+    found = eqx.filter_jit(robust)(legs((start, end, variance, wrong)))
+    a, w, _ = dense(net)
+    r = np.sqrt(w) * (a @ found.parameters["height"] - np.append(wrong, 1.5))
+    faded = np.asarray(loss.weight(jnp.asarray(r**2)))
+    np.testing.assert_allclose(
+        a.T @ (np.sqrt(w) * faded * r), np.zeros(NODES), atol=1e-7
+    )
+    assert found.result == RESULTS.successful and faded[400] < 0.01
+
+
+def test_derivatives_are_those_of_the_solution(net):
+    """Of a height by every rise: the row of Q Aᵀ P."""
+    a, w, _ = dense(net)
+    row = np.linalg.inv(a.T @ (w[:, None] * a))[17] @ (a.T * w)
+    start, end, variance, rise = net
+    height = lambda rise: solve(legs((start, end, variance, rise))).parameters[
+        "height"
+    ][17]
+    np.testing.assert_allclose(
+        jax.grad(height)(jnp.asarray(rise)), row[:-1], atol=1e-10
+    )
+
+
+# ------------------------------------------------------------------------------------
+# a bundle
+
+CAMERAS, POINTS, RAYS, CONTROL = 20, 500, 5, 12
+FOCAL, IMAGE_SIGMA, GROUND_SIGMA = 100.0, 0.005, 0.02
+
+
+def photo(xp, camera, point):
+    """Photo coordinates by the collinearity equations; the rotation by (1, w/2) as a
+    quaternion, not normalised."""
+    a, b, c = camera[0] / 2, camera[1] / 2, camera[2] / 2
+    x, y, z = point[0] - camera[3], point[1] - camera[4], point[2] - camera[5]
+    s = 1 + a * a + b * b + c * c
+    u = (
+        (1 + a * a - b * b - c * c) * x + 2 * (a * b - c) * y + 2 * (a * c + b) * z
+    ) / s
+    v = (
+        2 * (a * b + c) * x + (1 - a * a + b * b - c * c) * y + 2 * (b * c - a) * z
+    ) / s
+    w = (
+        2 * (a * c - b) * x + 2 * (b * c + a) * y + (1 - a * a - b * b + c * c) * z
+    ) / s
+    return xp.stack([-FOCAL * u / w, -FOCAL * v / w])
+
+
+@pytest.fixture(scope="module")
+def bundle():
+    """Photos over hilly ground, each point on some of them, some points known: what is
+    measured, and a start."""
+    rng = np.random.default_rng(1)
+    cameras = np.concatenate(
+        [
+            rng.normal(0, 0.1, (CAMERAS, 3)),
+            rng.uniform(-300, 300, (CAMERAS, 2)),
+            rng.uniform(900, 1100, (CAMERAS, 1)),
+        ],
+        axis=1,
+    )
+    points = np.concatenate(
+        [rng.uniform(-400, 400, (POINTS, 2)), rng.uniform(0, 150, (POINTS, 1))], axis=1
+    )
+    camera = np.concatenate([rng.permutation(CAMERAS)[:RAYS] for _ in range(POINTS)])
+    point = np.repeat(np.arange(POINTS), RAYS)
+    rays = photo(np, cameras[camera].T, points[point].T).T + rng.normal(
+        0, IMAGE_SIGMA, (POINTS * RAYS, 2)
+    )
+    ground = points[:CONTROL] + rng.normal(0, GROUND_SIGMA, (CONTROL, 3))
+    near = (
+        cameras + rng.normal(0, 1, cameras.shape) * [0.01, 0.01, 0.01, 5, 5, 5],
+        points + rng.normal(0, 5, points.shape),
+    )
+    return camera, point, rays, ground, near
+
+
+def terms_of(bundle):
+    camera, point, rays, ground, _ = bundle
+    image = lambda camera, point, measured: photo(jnp, camera, point) - measured
+    return [
+        Term(image, rays, IMAGE_SIGMA**2, [("camera", camera), ("point", point)]),
+        Term(
+            lambda point, known: point - known,
+            ground,
+            GROUND_SIGMA**2,
+            [("point", np.arange(CONTROL))],
+        ),
+    ]
+
+
+def oracle(bundle):
+    """Gauss-Newton on all 1,620 parameters at once, derivatives by complex steps:
+    cameras, points, Q, Σ r²."""
+    camera, point, rays, ground, (cameras, points) = bundle
+    rows, count = 2 * len(camera), 6 * CAMERAS
+    for _ in range(8):
+        j, step = np.zeros((rows + 3 * CONTROL, count + 3 * POINTS)), 1e-30
+        place = np.arange(rows).reshape(-1, 2)
+        for k in range(9):
+            c, p = cameras[camera].astype(complex), points[point].astype(complex)
+            (c if k < 6 else p)[:, k if k < 6 else k - 6] += 1j * step
+            column = 6 * camera + k if k < 6 else count + 3 * point + k - 6
+            j[place, column[:, None]] = photo(np, c.T, p.T).T.imag / step / IMAGE_SIGMA
+        j[rows + np.arange(3 * CONTROL), count + np.arange(3 * CONTROL)] = (
+            1 / GROUND_SIGMA
+        )
+        r = np.concatenate(
+            [
+                (
+                    (photo(np, cameras[camera].T, points[point].T).T - rays)
+                    / IMAGE_SIGMA
+                ).ravel(),
+                ((points[:CONTROL] - ground) / GROUND_SIGMA).ravel(),
+            ]
+        )
+        n = j.T @ j
+        delta = np.linalg.solve(n, j.T @ r)
+        cameras, points = (
+            cameras - delta[:count].reshape(-1, 6),
+            points - delta[count:].reshape(-1, 3),
+        )
+    return (
+        cameras,
+        points,
+        np.linalg.inv(n),
+        np.sum(r**2),
+        1 - np.einsum("gi,ij,gj->g", j, np.linalg.inv(n), j),
+    )
+
+
+def test_a_bundle_with_its_points_eliminated(bundle):
+    cameras, points, q, squares, redundancy = oracle(bundle)
+    start = {"camera": jnp.asarray(bundle[-1][0]), "point": jnp.asarray(bundle[-1][1])}
+    found = jax.jit(lambda start: adjust(terms_of(bundle), start, eliminate="point"))(
+        start
+    )
+    assert found.result == RESULTS.successful
+    count = 6 * CAMERAS
+    deviations = np.sqrt(np.diag(q))
+    unit = deviations[:, None] * deviations[None, :]
+    np.testing.assert_allclose(
+        (found.parameters["camera"] - cameras).ravel() / deviations[:count],
+        np.zeros(count),
+        atol=1e-8,
+    )
+    np.testing.assert_allclose(
+        (found.parameters["point"] - points).ravel() / deviations[count:],
+        np.zeros(3 * POINTS),
+        atol=1e-8,
+    )
+    np.testing.assert_allclose(
+        found.cofactor / unit[:count, :count], (q / unit)[:count, :count], atol=1e-9
+    )
+    of_points = np.stack(
+        [q[k : k + 3, k : k + 3] for k in range(count, count + 3 * POINTS, 3)]
+    )
+    variance = np.stack(
+        [unit[k : k + 3, k : k + 3] for k in range(count, count + 3 * POINTS, 3)]
+    )
+    np.testing.assert_allclose(
+        found.cofactors("point") / variance, of_points / variance, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        np.concatenate([r.ravel() for r in found.redundancy]), redundancy, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        found.sigma0**2 * int(found.degrees_of_freedom), squares, rtol=1e-9
+    )
+    assert (
+        found.degrees_of_freedom == 2 * POINTS * RAYS + 3 * CONTROL - count - 3 * POINTS
+    )
+    assert 0.9 < found.sigma0 < 1.1
+
+
+def test_a_bundle_without_control_is_told(bundle):
+    start = {"camera": jnp.asarray(bundle[-1][0]), "point": jnp.asarray(bundle[-1][1])}
+    free = jax.jit(
+        lambda start: adjust(terms_of(bundle)[:1], start, eliminate="point")
+    )(start)
+    assert free.result != RESULTS.successful
+
+
+def test_a_pair_as_one_of_several_terms_is_the_pair():
+    """Elements that move in their own way, as a family of two: two pairs at once are
+    each of them alone."""
+    pairs, _ = jaxro.mock_pairs.random_pairs(jax.random.key(2), 2, 12, focal=100.0)
+    noise = np.random.default_rng(2).normal(0, 0.01, (4, 2, 12))
+    coordinates = [
+        np.asarray(c) + e for c, e in zip(pairs.coordinates, noise, strict=True)
+    ]
+    alone = jaxro.orient_batch(jaxro.pair(*coordinates, focal=100.0, sigma=0.01))
+    flat = tuple(c.reshape(-1) for c in coordinates)
+
+    def condition(pose, point):
+        x1, y1, x2, y2 = point
+        rotation, base = pose.relative()
+        left, right = (
+            jnp.stack([x1, y1, -100.0]),
+            jnp.stack([jnp.stack(row) for row in rotation]),
+        )
+        return jnp.dot(
+            jnp.stack(base), jnp.cross(left, right @ jnp.stack([x2, y2, -100.0]))
+        )
+
+    term = Term(condition, flat, 1e-4, [("pose", np.repeat(np.arange(2), 12))])
+    start, off = (
+        jax.tree.map(lambda a: a[:2], alone.pose),
+        jnp.array([0.02, -0.01, 0.01, 0.02, -0.02]),
+    )
+    near = jax.vmap(lambda pose: pose.moved(tuple(off)).normalised())(start)
+    found = eqx.filter_jit(adjust)(term, {"pose": near})
+    for one, other in zip(
+        jax.tree.leaves(found.parameters["pose"]),
+        jax.tree.leaves(alone.pose),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+    unit = np.sqrt(np.einsum("kii->ki", np.asarray(alone.cofactor)))
+    unit = unit[:, :, None] * unit[:, None, :]
+    np.testing.assert_allclose(
+        found.cofactors("pose") / unit, alone.cofactor / unit, atol=1e-6
+    )
+
+
+# ------------------------------------------------------------------------------------
+# the parts
+
+
+@pytest.mark.parametrize("size", [1, 13, 32, 75])
+def test_inverse_of_a_badly_scaled_matrix(size):
+    rng = np.random.default_rng(size)
+    a = rng.normal(size=(2 * size, size)) * np.exp(rng.normal(0, 3, size))
+    inverse = np.linalg.inv(a.T @ a)
+    deviation = np.sqrt(np.diag(inverse))
+    found = jax.jit(symmetric.inverse)(jnp.asarray(a.T @ a))
+    unit = deviation[:, None] * deviation
+    np.testing.assert_allclose(found.matrix / unit, inverse / unit, atol=1e-12)
+    # the last pivot is what all others leave of its row
+    np.testing.assert_allclose(
+        found.pivots[-1], 1 / (inverse[-1, -1] * (a.T @ a)[-1, -1]), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("start", "eliminate", "said"),
+    [
+        ({"heights": jnp.zeros(NODES)}, None, "there are no parameters"),
+        (
+            {"height": jnp.zeros(NODES), "point": jnp.zeros((4, 3))},
+            None,
+            "no condition touches",
+        ),
+        ({"height": jnp.zeros(NODES)}, "height", "joins two blocks"),
+    ],
+)
+def test_what_cannot_be_adjusted_is_told(net, start, eliminate, said):
+    with pytest.raises(ValueError, match=said):
+        adjust([legs(net)], start, eliminate=eliminate)
+
+
+def test_a_member_that_is_not_there_is_told():
+    """JAX itself would take the last one."""
+    beyond = Term(
+        lambda height, known: height - known,
+        np.array([1.5]),
+        0.01,
+        [("height", np.array([3]))],
+    )
+    with pytest.raises(ValueError, match="not there"):
+        adjust(beyond, {"height": jnp.zeros(3)})
+
+
+def test_the_engine_knows_no_photo():
+    """Its imports stay within it and the compiler's seam, and it asks for no kind of
+    elements."""
+    import ast
+    from pathlib import Path
+
+    seam = {"programs", "reductions", "pointwise"}
+    for file in Path(jaxro.adjustment.__file__).parent.glob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        above = {
+            n.module or ""
+            for n in ast.walk(ast.parse(text))
+            if isinstance(n, ast.ImportFrom) and n.level > 1
+        }
+        assert above <= seam, file.name
+        assert "lements)" not in text, file.name

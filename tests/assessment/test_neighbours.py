@@ -1,0 +1,264 @@
+"""The test of agreement between the residuals of neighbouring points, and the accuracy
+where there is some."""
+
+import json
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import jaxro
+from jaxro import IndependentElements, Pair
+from jaxro.assessment import correlated_covariance, neighbours, pattern, pooled
+from jaxro.cli import app
+from jaxro.geometry import mock_pairs
+from jaxro.geometry.linear import linearised
+from jaxro.rejection.robust import improved
+
+SIGMA = 0.005
+PHOTO = 140.0
+ELEMENTS = (0.03, -0.05, 0.04, -0.02, 0.06)
+
+
+def places(
+    points: int, regular: bool, pairs: int, rng: np.random.Generator
+) -> np.ndarray:
+    """(pair, 3, point): x and y in the overlap of 90 by 140 mm, random or on a grid,
+    and heights."""
+    if regular:
+        wide, long = {16: (4, 4), 40: (5, 8), 100: (8, 13)}[points]
+        grid = np.stack(
+            np.meshgrid(np.linspace(-10, 80, wide), np.linspace(-70, 70, long))
+        ).reshape(2, -1)
+        xy = np.broadcast_to(grid[:, :points], (pairs, 2, points))
+    else:
+        xy = rng.uniform([[-10], [-70]], [[80], [70]], (pairs, 2, points))
+    return np.concatenate([xy, rng.uniform(-8, 8, (pairs, 1, points))], axis=1)
+
+
+@cache
+def programs():
+    """The errorless pairs; the orientation from their errors and the test; each
+    compiled once a shape."""
+    elements = IndependentElements(*(jnp.asarray(e) for e in ELEMENTS))
+
+    def ideal(place) -> Pair:
+        layout = mock_pairs.Layout(place[0] / 70, place[1] / 70, ())
+        return mock_pairs.mock_pair(layout, elements, heights=place[2])
+
+    def solved(place, errors):
+        names = ("x_left", "y_left", "x_right", "y_right")
+        pair = mock_pairs.planted(ideal(place), **dict(zip(names, errors, strict=True)))
+        pose = jax.lax.fori_loop(
+            0, 4, lambda _, p: improved(pair, p, pair.mask), jaxro.to_pose(elements)
+        )
+        return neighbours.of_linear(linearised(pair, pose), pair.coordinates)
+
+    return jax.jit(jax.vmap(ideal)), jax.jit(
+        lambda *a: jax.lax.map(lambda one: solved(*one), a, batch_size=50)
+    )
+
+
+def correlated_errors(
+    pairs: Pair, rho: float, length: float, rng: np.random.Generator
+) -> np.ndarray:
+    """(pair, 4, point) errors of variance sigma², correlated by rho exp(-(d/l)²) in
+    each coordinate of a photo."""
+    coordinates = [np.asarray(c) for c in pairs.coordinates]
+    every = []
+    for x, y in (coordinates[:2], coordinates[2:]):
+        squared = (x[:, :, None] - x[:, None]) ** 2 + (y[:, :, None] - y[:, None]) ** 2
+        covariance = (1 - rho + 1e-9) * np.eye(x.shape[1]) + rho * np.exp(
+            -squared / length**2
+        )
+        factor = np.linalg.cholesky(covariance)
+        every += [(factor @ rng.normal(size=(*x.shape, 1)))[..., 0] for _ in range(2)]
+    return SIGMA * np.stack(every, axis=1)
+
+
+def judged(
+    points: int,
+    regular: bool,
+    pairs: int,
+    rho: float = 0.0,
+    length: float = 0.1 * PHOTO,
+    seed: int = 0,
+):
+    rng = np.random.default_rng(seed)
+    ideal, solved = programs()
+    place = places(points, regular, pairs, rng)
+    if rho:
+        return solved(place, correlated_errors(ideal(place), rho, length, rng))
+    return solved(place, SIGMA * rng.normal(size=(pairs, 4, points)))
+
+
+def test_level_and_power():
+    """Independent errors are flagged in 5 %; of errors correlated by .5 over a tenth of
+    the photo, a pair of forty points shows 44 %, where the most powerful test of known
+    rho and length has 47; ten pairs together show it."""
+    flagged = np.mean(np.asarray(judged(40, False, 1500).probability) < 0.05)
+    assert abs(flagged - 0.05) < 0.015
+    found = judged(40, False, 200, rho=0.5)
+    assert np.mean(np.asarray(found.probability) < 0.05) > 0.33
+    together = jax.vmap(pooled)(jax.tree.map(lambda a: a.reshape(-1, 10), found))
+    assert np.all(np.asarray(together.probability) < 0.05)
+    np.testing.assert_allclose(np.median(together.rho), 0.5, atol=0.15)
+    np.testing.assert_allclose(np.median(together.length), 0.1 * PHOTO, rtol=0.4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("regular", [False, True])
+@pytest.mark.parametrize("points", [16, 40, 100])
+def test_level_at_full_size(points, regular):
+    flagged = np.mean(
+        np.asarray(
+            judged(points, regular, 10_000 if points < 100 else 4_000).probability
+        )
+        < 0.05
+    )
+    assert abs(flagged - 0.05) < (0.009 if points < 100 else 0.012)
+
+
+def test_probability_is_that_of_a_simulation():
+    """The statistic written as sums over pairs of points, R by a QR decomposition,
+    20,000 draws of independent errors; NumPy arrays and JAX arrays give the same."""
+    rng = np.random.default_rng(3)
+    ideal, _ = programs()
+    place = places(40, False, 1, rng)
+    errors = correlated_errors(ideal(place), 0.4, 20.0, rng)[0]
+    pair = jax.tree.map(lambda a: a[0], ideal(place))
+    pair = mock_pairs.planted(
+        pair, x_left=errors[0], y_left=errors[1], x_right=errors[2], y_right=errors[3]
+    )
+    photo = jaxro.orient(pair)
+    found = pattern(pair, photo)
+    linear, coordinates = jax.tree.map(
+        np.asarray, (linearised(pair, photo.pose), pair.coordinates)
+    )
+    in_numpy = neighbours.of_linear(linear, coordinates)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(in_numpy), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8)
+
+    b = np.stack(linear.gradient)
+    u = b / np.sqrt(np.sum(b * b, axis=0))
+    xl, yl, xr, yr = coordinates
+    side = np.sqrt(np.ptp(xl) * np.ptp(yl))
+    k = np.zeros((40, 40))
+    for i in range(40):
+        for j in range(40):
+            for l in (0.025, 0.05, 0.1, 0.2):
+                if i != j:
+                    left = np.exp(
+                        -((xl[i] - xl[j]) ** 2 + (yl[i] - yl[j]) ** 2) / (l * side) ** 2
+                    )
+                    right = np.exp(
+                        -((xr[i] - xr[j]) ** 2 + (yr[i] - yr[j]) ** 2) / (l * side) ** 2
+                    )
+                    k[i, j] += (u[:2, i] @ u[:2, j]) * left + (
+                        u[2:, i] @ u[2:, j]
+                    ) * right
+    root = np.sqrt(linear.weight)
+    basis, _ = np.linalg.qr(np.stack(linear.columns, axis=1) * root[:, None])
+    statistic = lambda r: np.einsum("si,ij,sj->s", r, k, r) / np.sum(r * r, axis=1)
+    draws = rng.normal(size=(20_000, 40))
+    chance = np.mean(
+        statistic(draws - draws @ basis @ basis.T)
+        >= statistic((linear.g * root)[None, :])
+    )
+    np.testing.assert_allclose(found.probability, chance, atol=0.006)
+
+
+def test_padding_and_sigma_change_nothing():
+    """Masked points take no part; the probability does not depend on sigma."""
+    pair = mock_pairs.noisy(
+        mock_pairs.mock_pair(mock_pairs.row_layout()), jax.random.key(1), SIGMA
+    )
+    found = pattern(pair, jaxro.orient(pair))
+    wide = jaxro.pad(pair, 20)
+    again = pattern(wide, jaxro.orient(wide))
+    other = Pair(
+        *pair.coordinates,
+        0.01 * pair.sigma,
+        pair.mask,
+        pair.focal_left,
+        pair.focal_right,
+    )
+    for same in (again, pattern(other, jaxro.orient(other))):
+        np.testing.assert_allclose(same.probability, found.probability, rtol=1e-6)
+        np.testing.assert_allclose(same.rho, found.rho, rtol=1e-6, atol=1e-9)
+    six = mock_pairs.noisy(
+        mock_pairs.mock_pair(mock_pairs.standard_layout(6)), jax.random.key(1), SIGMA
+    )
+    assert pattern(six, jaxro.orient(six)).probability == 1  # one degree of freedom
+
+
+@pytest.mark.parametrize("elements", [jaxro.RelativePose, IndependentElements])
+def test_correlated_covariance_is_the_scatter(elements):
+    """The deviations of 2,000 orientations from correlated errors; without correlation
+    those of the adjustment."""
+    rng = np.random.default_rng(5)
+    ideal, _ = programs()
+    place = np.repeat(places(40, False, 1, rng), 2_000, axis=0)
+    pairs = ideal(place)
+    errors = correlated_errors(pairs, 0.5, 40.0, rng)
+    measured = [
+        c + e for c, e in zip(pairs.coordinates, errors.transpose(1, 0, 2), strict=True)
+    ]
+    noisy = Pair(
+        *measured, pairs.sigma, pairs.mask, pairs.focal_left, pairs.focal_right
+    )
+    found = jaxro.orient_batch(noisy, elements=elements)
+    one = jax.tree.map(lambda a: a[:50], (noisy, found))
+    told = jax.jit(jax.vmap(lambda p, o: correlated_covariance(p, o, 0.5, 40.0)))(*one)
+    variance = np.mean(
+        np.diagonal(np.asarray(told.covariance), axis1=1, axis2=2), axis=0
+    )
+    if elements is IndependentElements:
+        scatter = np.var(np.stack(found.elements.values(), axis=1), axis=0)
+        np.testing.assert_allclose(np.sqrt(variance), np.sqrt(scatter), rtol=0.1)
+        assert np.max(np.asarray(told.growth)) > 1.5
+    np.testing.assert_allclose(np.mean(told.sigma0), SIGMA, rtol=0.06)
+    plain = correlated_covariance(*jax.tree.map(lambda a: a[0], one), 0.0, 40.0)
+    np.testing.assert_allclose(
+        plain.covariance, found.covariance[0], rtol=1e-5, atol=1e-14
+    )
+    np.testing.assert_allclose(plain.growth, 1, rtol=1e-9)
+
+
+def test_report_says_it(tmp_path):
+    """One pair and a table of three, correlated errors: the sentence, and probability
+    and rho in the JSON."""
+    rng = np.random.default_rng(2)
+    ideal, _ = programs()
+    pairs = ideal(places(40, False, 3, rng))
+    errors = correlated_errors(pairs, 0.8, 30.0, rng)
+    measured = np.stack(pairs.coordinates, axis=1) + errors
+    for count in (1, 3):
+        rows = ["pair,point,x_left,y_left,x_right,y_right"]
+        rows += [
+            f"p{k},{i},{','.join(map(repr, map(float, measured[k, :, i])))}"
+            for k in range(count)
+            for i in range(40)
+        ]
+        table, out = tmp_path / f"{count}.csv", tmp_path / f"out{count}"
+        table.write_text("\n".join(rows) + "\n", encoding="utf-8")
+        told = CliRunner().invoke(
+            app, ["orient", str(table), "--focal", "70", "--out", str(out)]
+        )
+        assert told.exit_code == 0, told.output
+        summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+        assert (
+            "The standard deviations assume independent errors; here neighbours"
+            in " ".join(told.output.split())
+        )
+        assert (
+            summary["pattern"]["probability"] < 0.05
+            and 0.3 < summary["pattern"]["rho"] <= 1
+        )
+        assert all(
+            p["pattern"] is not None and p["pattern"]["length_mm"] > 0
+            for p in summary["pairs"]
+        )

@@ -1,0 +1,402 @@
+"""`jaxro clean` as its user meets it: which point is wrong, every row kept, files whole
+or none."""
+
+import csv
+import json
+import math
+
+import jax
+import numpy as np
+import pytest
+from test_tables import write
+from typer.testing import CliRunner
+
+import jaxro
+from jaxro.cli import app
+from jaxro.commands import tolerances
+from jaxro.geometry import mock_pairs
+from jaxro.rejection import OUTCOMES, PROCEDURES, Dorozhinsky, TwoStage
+from jaxro.reports import verdicts
+from jaxro.tables import csv as tables
+from jaxro.tables.examples import mock_pair as mock_example
+
+FILES = {
+    "cleaned.csv",
+    "decisions.csv",
+    "decisions.json",
+    "elements.csv",
+    "residuals.csv",
+    "points.csv",
+    "reliability.csv",
+    "summary.json",
+}
+FOCAL = ["--focal", str(mock_example.FOCAL)]
+PLAIN = ["--procedure", "three-sigma"]
+"""The quickest to compile."""
+
+
+def run(*arguments):
+    result = CliRunner().invoke(
+        app, ["clean", *map(str, arguments)], env={"COLUMNS": "200"}
+    )
+    assert result.exception is None or isinstance(result.exception, SystemExit), (
+        result.exception
+    )
+    return result
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory):
+    """The example as a user's file."""
+    return write(tmp_path_factory.mktemp("sample"), mock_example.TABLE, "mock.csv")
+
+
+@pytest.fixture(scope="module")
+def cleaned(sample, tmp_path_factory):
+    """The example cleaned by the algorithm of 1971, and its files."""
+    out = tmp_path_factory.mktemp("cleaned") / "new" / "out"
+    return run(sample, *FOCAL, "--procedure", "dorozhinsky", "--out", out), out
+
+
+def test_the_wrong_point_is_named_with_its_evidence(cleaned):
+    result, _ = cleaned
+    assert result.exit_code == 0 and not result.stderr
+    words = " ".join(result.stdout.split())
+    assert "Cleaning of mock by dorozhinsky: 1 of 12 points rejected" in words
+    # order, |q| after one correction against eps3, q at the orientation of the other
+    # eleven: the error with its sign
+    assert "7 1 0.6841 0.1 -1.08" in words
+    assert (
+        "Relative orientation of mock, 11 points" in words
+        and "6 degrees of freedom" in words
+    )
+
+
+def test_every_row_is_kept_with_its_verdict(cleaned, sample):
+    _, out = cleaned
+    assert {path.name for path in out.iterdir()} == FILES and len(
+        list(out.parent.iterdir())
+    ) == 1
+    (measured,) = tables.read(sample).pairs
+    written = rows(out / "cleaned.csv")
+    assert [row["point"] for row in written] == measured.points
+    numbers = [[float(row[c]) for c in tables.NUMBERS] for row in written]
+    np.testing.assert_array_equal(numbers, measured.rows)
+    verdicts = {row["point"]: (row["verdict"], row["order"]) for row in written}
+    assert verdicts == {
+        **dict.fromkeys(measured.points, ("kept", "")),
+        "7": ("rejected", "1"),
+    }
+    residuals = {
+        row["point"]: float(row["q_mm"]) for row in rows(out / "residuals.csv")
+    }
+    assert list(residuals) == [p for p in measured.points if p != "7"]
+    for row in written:
+        assert (float(row["statistic"]) > float(row["limit"])) == (
+            row["verdict"] == "rejected"
+        )
+        if row["point"] != "7":
+            assert math.isclose(
+                float(row["q_mm"]), residuals[row["point"]], abs_tol=1e-12
+            )
+    assert abs(float(written[6]["q_mm"]) + 1.1) < 0.03
+
+
+def test_the_log_is_that_of_python_to_the_last_digit(cleaned, sample):
+    _, out = cleaned
+    (measured,) = tables.read(sample).pairs
+    pair = jaxro.pair(
+        *measured.coordinates, focal=mock_example.FOCAL, sigma=measured.sigma
+    )
+    _, batch = jaxro.clean_batch(
+        jaxro.stack([pair]), Dorozhinsky(), select=verdicts.with_log
+    )
+    found = jax.tree.map(lambda a: a[0], batch)
+    happened = np.asarray(found.happened)
+    log = rows(out / "decisions.csv")
+    numbers = [int(row["round"]) for row in log]
+    assert sorted(set(numbers)) == list(range(1, happened.sum() + 1))
+    assert (
+        numbers.count(1) == 12 and numbers.count(happened.sum()) == 11
+    )  # a rejected point is in no later round
+    table = {(int(row["round"]), row["point"]): row for row in log}
+    for number, place in enumerate(np.flatnonzero(happened), 1):
+        limit = float(found.limit[place])
+        for i, name in enumerate(measured.points):
+            row = table.get((number, name))
+            if row is None:
+                continue
+            wanted = found.statistic[place, i], found.parallax[place, i]
+            assert (float(row["statistic"]), float(row["parallax_mm"])) == tuple(
+                map(float, wanted)
+            )
+            assert (row["limit"] == "") == math.isinf(limit) and (
+                not row["limit"] or float(row["limit"]) == limit
+            )
+            assert (row["rejected"] == "true") == bool(found.rejected[place, i])
+    summary = json.loads(
+        (out / "decisions.json").read_text(), parse_constant=pytest.fail
+    )
+    assert (
+        summary["procedure"] == "dorozhinsky" and summary["tolerances"]["eps3"] == 0.1
+    )
+    (only,) = summary["pairs"]
+    assert (only["outcome"], only["rejected"], only["order"]) == (
+        "finished",
+        1,
+        [["7"]],
+    )
+    elements = [
+        [row[f"{n}_deg"] for n in jaxro.IndependentElements.names]
+        for row in only["elements"]
+    ]
+    np.testing.assert_array_equal(
+        elements, np.rad2deg(np.asarray(found.elements)[happened])
+    )
+
+
+def table_1(points):
+    """Lines of the pair of table 1 (1971) with so many points."""
+    flat = mock_pairs.mock_pair(mock_pairs.standard_layout(points))
+    errors = np.array([0, 0, 0, 0, 0, 0, 2.0, 2.2, -2.43, -1.90])[:points]
+    columns = np.stack(
+        [np.asarray(c) for c in mock_pairs.planted(flat, y_right=errors).coordinates],
+        axis=-1,
+    )
+    return [
+        f"{i}," + ",".join(map(repr, map(float, row)))
+        for i, row in enumerate(columns, 1)
+    ]
+
+
+def test_many_pairs_keep_their_rows_in_order_and_say_what_is_left_to_do(tmp_path):
+    example = [line.rsplit(",", 1)[0] for line in mock_example.TABLE.split()[1:]]
+    pairs = {"good": example, "[four]": example[:4], "1971": table_1(10)}
+    lines = [
+        f"{name},{pairs[name][i]}"
+        for i in range(12)
+        for name in pairs
+        if i < len(pairs[name])
+    ]
+    path = write(
+        tmp_path,
+        "pair,point,x_left,y_left,x_right,y_right\n" + "\n".join(lines),
+        "pairs.csv",
+    )
+    out = tmp_path / "out"
+    strict = [
+        "--procedure",
+        "dorozhinsky",
+        "--tolerance",
+        "eps3=0.01",
+        "--tolerance",
+        "eps4 = 0.02",
+    ]
+    result = run(path, *FOCAL, *strict, "--out", out)
+    assert result.exit_code == 1
+    words = " ".join(result.stdout.split())
+    assert (
+        "OPERATOR_NEEDED 1971 (1 pair)" in words
+        and "NOT_ORIENTED [four] (1 pair)" in words
+    )
+    assert "finished (1 pair)" in words and "good 7 1 0.6841 0.01 -1.08" in words
+    written = rows(out / "cleaned.csv")
+    assert [(row["pair"], row["point"]) for row in written] == [
+        tuple(line.split(",")[:2]) for line in lines
+    ]
+    order = {
+        (row["pair"], row["point"]): row["order"]
+        for row in written
+        if row["verdict"] == "rejected"
+    }
+    assert order == {
+        ("good", "7"): "1",
+        ("1971", "9"): "1",
+        ("1971", "4"): "2",
+        ("1971", "6"): "3",
+        ("1971", "3"): "4",
+    }
+    # what does not exist is an empty cell: the parallax of a pair that is not oriented
+    assert {bool(row["q_mm"]) for row in written if row["pair"] == "[four]"} == {False}
+    outcomes = {
+        p["pair"]: p["outcome"]
+        for p in json.loads((out / "decisions.json").read_text())["pairs"]
+    }
+    assert outcomes == {
+        "good": "finished",
+        "[four]": "not_oriented",
+        "1971": "operator_needed",
+    }
+    elements = {row["pair"]: row for row in rows(out / "elements.csv")}
+    assert {name: row["points"] for name, row in elements.items()} == {
+        "good": "11",
+        "[four]": "4",
+        "1971": "6",
+    }
+    assert len(rows(out / "residuals.csv")) == 11 + 4 + 6
+
+
+BAD_OPTIONS = {
+    "unknown procedure": (["--procedure", "guess"], ["'guess'", *PROCEDURES]),
+    "unknown tolerance": (
+        [*PLAIN, "--tolerance", "eps=1"],
+        ["'eps'", "factor=3.0", "more_than=9", "least=6"],
+    ),
+    "no value": (
+        [*PLAIN, "--tolerance", "factor"],
+        ["'factor' without =", "factor=3.0"],
+    ),
+    "two meanings": (
+        ["--procedure", "two-stage", "--tolerance", "least=7"],
+        ["first.least or second.least"],
+    ),
+    "no number": ([*PLAIN, "--tolerance", "factor=x"], ["factor=x", "a number"]),
+    "negative": ([*PLAIN, "--tolerance", "factor=-1"], ["factor=-1", "not negative"]),
+    "half a point": (
+        [*PLAIN, "--tolerance", "least=6.5"],
+        ["least=6.5", "a whole number"],
+    ),
+    "nothing is above it": (
+        ["--tolerance", "level=1.5"],
+        ["level=1.5", "between 0 and 1"],
+    ),
+    "all are above it": (
+        ["--procedure", "igg3", "--tolerance", "limit=0"],
+        ["limit=0", "above 0"],
+    ),
+    "empty": (["--procedure", ""], ["''", *PROCEDURES]),
+    "infinite": ([*PLAIN, "--tolerance", "factor=inf"], ["factor=inf"]),
+    "no focal length": (PLAIN, ["neither --focal nor --camera"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_OPTIONS)
+def test_bad_options_write_nothing(case, sample, tmp_path):
+    options, found = BAD_OPTIONS[case]
+    focal = [] if case == "no focal length" else FOCAL
+    result = run(sample, *focal, *options, "--out", tmp_path / "out")
+    assert result.exit_code == 2 and not result.stdout and not list(tmp_path.iterdir())
+    assert all(text in result.stderr for text in found), result.stderr
+
+
+def test_what_judges_by_sigma_is_not_run_without_one(tmp_path):
+    path = write(
+        tmp_path,
+        mock_example.TABLE.replace(",.003", "").replace(",sigma", ""),
+        "pairs.csv",
+    )
+    result = run(
+        path, *FOCAL, "--procedure", "data-snooping", "--out", tmp_path / "out"
+    )
+    assert (
+        result.exit_code == 2
+        and "--sigma" in result.stderr
+        and list(tmp_path.iterdir()) == [path]
+    )
+    assert not tolerances.judges_by_sigma(PROCEDURES["tau"])
+
+
+def test_tolerances_reach_every_part():
+    changed = tolerances.changed(
+        TwoStage(), ["eps3=0.2", "second.level=0.01", "exact=false", "first.least=7"]
+    )
+    assert (
+        changed.first == Dorozhinsky(eps3=0.2, least=7)
+        and type(changed.first.least) is int
+    )
+    assert (changed.second.level, changed.second.exact, changed.second.least) == (
+        0.01,
+        False,
+        6,
+    )
+    for procedure in PROCEDURES.values():
+        for name, value in tolerances.tolerances(procedure).items():
+            text = "0.5" if value is None else str(value).lower()
+            after = tolerances.tolerances(
+                tolerances.changed(procedure, [f"{name}={text}"])
+            )
+            assert after == {
+                **tolerances.tolerances(procedure),
+                name: 0.5 if value is None else value,
+            }
+
+
+def test_nothing_is_left_of_a_result_that_could_not_be_written(
+    sample, tmp_path, monkeypatch
+):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("jaxro.tables.whole.os.replace", full)
+    result = run(
+        sample, *FOCAL, "--procedure", "dorozhinsky", "--out", tmp_path / "out"
+    )
+    assert (
+        result.exit_code == 2
+        and "No space left" in result.stderr
+        and not list(tmp_path.iterdir())
+    )
+
+
+def test_every_outcome_has_a_name_and_advice():
+    assert (
+        verdicts.NAMES[int(OUTCOMES.finished._value)] == "finished"
+        and not verdicts.ADVICE["finished"]
+    )
+    assert all(
+        verdicts.ADVICE[name]
+        for name in ("operator_needed", "nothing_to_test", "not_oriented")
+    )
+
+
+def test_points_that_nothing_tells_apart_are_named(tmp_path):
+    """An error in one of four points that stand alone in their zones: in the report,
+    the tables and the summary."""
+    flat = mock_pairs.planted(
+        mock_pairs.mock_pair(mock_pairs.standard_layout(8)), y_right=np.eye(8)[0] * 0.4
+    )
+    columns = np.stack([np.asarray(c) for c in flat.coordinates], axis=-1)
+    lines = [
+        f"{name},{','.join(map(repr, map(float, row)))}"
+        for name, row in zip("abcdefgh", columns, strict=True)
+    ]
+    path = write(
+        tmp_path,
+        "point,x_left,y_left,x_right,y_right\n" + "\n".join(lines),
+        "eight.csv",
+    )
+    out = tmp_path / "out"
+    result = run(
+        path,
+        "--focal",
+        70,
+        "--sigma",
+        0.01,
+        "--procedure",
+        "data-snooping",
+        "--out",
+        out,
+    )
+    assert result.exit_code == 1
+    words = " ".join(result.stdout.split())
+    assert (
+        "0 of 8 points rejected" in words
+        and "wrong is one of a, b, e, f; nothing tells which" in words
+    )
+    assert "UNDECIDED eight" in words
+    verdicts = {row["point"]: row["verdict"] for row in rows(out / "cleaned.csv")}
+    assert verdicts == {
+        **dict.fromkeys("abcdefgh", "kept"),
+        **dict.fromkeys("abef", "undecided"),
+    }
+    (only,) = json.loads((out / "decisions.json").read_text())["pairs"]
+    assert (only["outcome"], only["undecided"], only["order"]) == (
+        "undecided",
+        ["a", "b", "e", "f"],
+        [],
+    )

@@ -1,0 +1,201 @@
+"""Reading tables and cameras: what fits is read whole, what does not stops with file,
+line and column."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxro import Camera
+from jaxro.tables import cameras, csv as tables
+from jaxro.tables.examples import pair as example
+from jaxro.tables.fields import TableError
+
+HEAD = "point,x_left,y_left,x_right,y_right"
+A, B = "a,1,2,3,4", "b,5,6,7,8"
+
+BAD_TABLES = {
+    "empty file": ("", 1, None, "no text"),
+    "header only": (f"{HEAD}\n\n", 2, None, "no points"),
+    "missing column": (
+        "point,x_left,y_left,x_right\na,1,2,3",
+        1,
+        "y_right",
+        "no such column",
+    ),
+    "duplicate column": (f"{HEAD},x_left\n{A},5", 1, "x_left", "second time"),
+    "duplicate in the short form": (f"{HEAD},xl\n{A},5", 1, "xl", "second time"),
+    "unknown column": (f"{HEAD},weight\n{A},5", 1, "weight", "unknown column 'weight'"),
+    "column without a name": (f"{HEAD},\n{A},5", 1, None, "no name in field 6"),
+    "semicolons": (f"{HEAD}\n{A}".replace(",", ";"), 1, None, "point;x_left"),
+    "not a number": (f"{HEAD}\n{A}\nb,5,6,7.1x,8", 3, "x_right", "'7.1x'"),
+    "number with an underscore": (f"{HEAD}\na,1_0,2,3,4", 2, "x_left", "'1_0'"),
+    "no number": (f"{HEAD}\na,1,,3,4", 2, "y_left", "an empty field"),
+    "NaN": (f"{HEAD}\n{A}\n\nb,5,6,7,nan", 4, "y_right", "'nan'"),
+    "infinite": (f"{HEAD}\na,-inf,2,3,4", 2, "x_left", "'-inf'"),
+    "too large": (f"{HEAD}\na,1e999,2,3,4", 2, "x_left", "'1e999'"),
+    "negative sigma": (f"{HEAD},sigma\n{A},-.1", 2, "sigma", "'-.1'"),
+    "zero sigma": (f"{HEAD},sigma\n{A},0", 2, "sigma", "'0'"),
+    "same point twice": (f"{HEAD}\n{A}\n{B}\na,9,9,9,9", 4, "point", "first on line 2"),
+    "point without a name": (f"{HEAD}\n ,1,2,3,4", 2, "point", "an empty field"),
+    "pair without a name": (f"pair,{HEAD}\n,{A}", 2, "pair", "an empty field"),
+    "too few fields": (f"{HEAD}\n{A}\nb,5,6", 3, "x_right", "3 fields"),
+    "decimal commas": (f"{HEAD}\na,1,5,2,3,4", 2, None, "6 fields"),
+    "open quotation": (f'{HEAD}\n"a,1,2,3,4\n{B}', 3, None, "unexpected end of data"),
+    "not UTF-8": (
+        f"{HEAD}\n{A}\n".encode() + "ž,5,6,7,8".encode("cp1250"),
+        3,
+        None,
+        "0x9e",
+    ),
+    "UTF-16": (HEAD.encode("utf-16"), 1, None, "0xff"),
+}
+
+BAD_CAMERAS = {
+    "no TOML": ("[camera]\nfocal 3", 2, None, "no valid TOML"),
+    "nothing": ("", None, None, "no entries"),
+    "unknown table": ("[cameras]\nfocal = 3", None, None, "cameras"),
+    "mixed forms": (
+        "[camera]\nfocal = 3\n[left]\nfocal = 4",
+        None,
+        None,
+        "camera, left",
+    ),
+    "one side": ("[left]\nfocal = 4", None, None, "left"),
+    "unknown key": (
+        "[camera]\nfocal = 3\nfocus = 3 # mm",
+        3,
+        "camera.focus",
+        "unknown key",
+    ),
+    "no focal length": ("\n[camera]\ny_down = true", 2, "camera.focal", "no such key"),
+    "focal length as text": ('[camera]\nfocal = "3"', 2, "camera.focal", "'3'"),
+    "negative focal length": (
+        "[left]\nfocal = 3\n[right]\nfocal = -3",
+        4,
+        "right.focal",
+        "-3",
+    ),
+    "truth as a number": ("[camera]\nfocal = true", 2, "camera.focal", "True"),
+    "infinite pixel size": (
+        "[camera]\nfocal = 3\npixel_size = inf",
+        3,
+        "camera.pixel_size",
+        "inf",
+    ),
+    "one coordinate": (
+        '[photo."1"]\nfocal = 3\nprincipal_point = [1]',
+        3,
+        "photo.1.principal_point",
+        "[1]",
+    ),
+    "y_down as a number": ("[camera]\nfocal = 3\ny_down = 1", 3, "camera.y_down", "1"),
+}
+
+
+def write(folder, content, name):
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize("case", BAD_TABLES)
+def test_bad_tables_are_named_by_file_line_and_column(case, tmp_path):
+    content, line, column, found = BAD_TABLES[case]
+    path = write(tmp_path, content, "pairs.csv")
+    with pytest.raises(TableError) as caught:
+        tables.read(path)
+    error = caught.value
+    assert (error.file, error.line, error.column) == (str(path), line, column)
+    assert found in error.found and error.expected
+    assert f"{path}, line {line}" in str(error) and "\n" not in str(error)
+
+
+@pytest.mark.parametrize("case", BAD_CAMERAS)
+def test_bad_cameras_are_named_by_file_line_and_key(case, tmp_path):
+    content, line, key, found = BAD_CAMERAS[case]
+    path = write(tmp_path, content, "camera.toml")
+    with pytest.raises(TableError) as caught:
+        cameras.read(path)
+    assert (caught.value.file, caught.value.line, caught.value.column) == (
+        str(path),
+        line,
+        key,
+    )
+    assert found in caught.value.found
+
+
+def test_unreadable_files(tmp_path):
+    for path in (tmp_path / "missing.csv", tmp_path):
+        with pytest.raises(TableError, match="that can be read"):
+            tables.read(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{HEAD}\n{A}\n{B}\n",
+        f"\ufeffid,xl,yl,xr,yr\r\n{A}\r\n\r\n{B}",
+        ' Point , X_LEFT,y_left,x_right,y_right\n"a", 1,2 ,3,+4.0\n,,,,\nb,5e0,6.,7,8',
+        "y_right,point,x_left,y_left,x_right\n4,a,1,2,3\n8,b,5,6,7",
+    ],
+)
+def test_one_table_written_in_many_ways(text, tmp_path):
+    (only,) = tables.read(write(tmp_path, text, "left_right.csv")).pairs
+    assert (
+        only.name == "left_right" and only.points == ["a", "b"] and only.sigma is None
+    )
+    np.testing.assert_array_equal(only.coordinates, [[1, 5], [2, 6], [3, 7], [4, 8]])
+
+
+def test_pairs_keep_their_order_and_their_sigmas():
+    text = f"pair,sigma,{HEAD}\nq,.1,{A}\np,.2,{A}\nq,.3,{B}\n"
+    table = tables.parse(text, "file", "unused")
+    assert [(one.name, one.points, one.lines) for one in table.pairs] == [
+        ("q", ["a", "b"], [2, 4]),
+        ("p", ["a"], [3]),
+    ]
+    np.testing.assert_array_equal(table.pairs[0].sigma, [0.1, 0.3])
+    assert not table.warnings, "the same point in two pairs is no repetition"
+
+
+def test_a_point_under_two_names_is_a_warning():
+    (warning,) = tables.parse(f"{HEAD}\n{A}\n{B}\nc,1,2,3,4.0", "file", "pair").warnings
+    assert "c = a (line 4)" in warning and "degrees of freedom" in warning
+
+
+def test_cameras_of_every_form(tmp_path):
+    name = "in-strip_1_10"
+    forms = {
+        "[camera]\nfocal = 3": (3, 3),
+        "[left]\nfocal = 3\n[right]\nfocal = 4": (3, 4),
+        "[photo.10]\nfocal = 4\n[photo.in-strip_1]\nfocal = 3\n[photo.in]\nfocal = 5": (
+            3,
+            4,
+        ),
+    }
+    for text, focals in forms.items():
+        both = cameras.read(write(tmp_path, text, "camera.toml")).of(name, "pairs.csv")
+        assert tuple(camera.focal for camera in both) == focals
+    photos = cameras.read(
+        write(tmp_path, "[photo.1]\nfocal = 3\n[photo.2]\nfocal = 4", "camera.toml")
+    )
+    with pytest.raises(TableError, match=r"line 2, column pair.*LEFT-RIGHT") as caught:
+        photos.of(name, "pairs.csv", 2)
+    assert "1, 2" in caught.value.expected
+
+
+def test_photo_coordinates_are_those_of_the_camera():
+    (measured,) = tables.parse(example.TABLE, "file", "pair").pairs
+    left, right = Camera(150.0, (3.0, -4.0), 0.5, True), Camera(100.0)
+    pair = cameras.to_pair(measured, "file", left, right)
+    u, v, *_ = map(jnp.asarray, measured.coordinates)
+    for got, wanted in zip(
+        (pair.x_left, pair.y_left), left.to_photo(u, v), strict=True
+    ):
+        np.testing.assert_array_equal(got, wanted)
+    assert (float(pair.focal_left), float(pair.focal_right)) == (150.0, 100.0)
+    np.testing.assert_array_equal(
+        cameras.to_pair(measured, "file", left, left, 0.01).sigma, 0.005
+    )
+    with pytest.raises(TableError, match="pixel size"):
+        cameras.to_pair(measured, "file", left, right, 0.01)
