@@ -8,7 +8,7 @@ import math
 import jax
 import numpy as np
 import pytest
-from test_tables import write
+from bad_tables import write
 from typer.testing import CliRunner
 
 import jaxro

@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_tables import BAD_CAMERAS, BAD_TABLES, write
+from bad_tables import BAD_CAMERAS, BAD_TABLES, write
 from typer.testing import CliRunner
 from workload import aerial
 

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_tables import write
+from bad_tables import write
 from typer.testing import CliRunner
 
 from jaxro.cli import app

@@ -12,8 +12,8 @@ import numpy as np
 import oracles
 import problems
 import pytest
+from bad_tables import write
 from jaxtyping import Array, Float
-from test_tables import write
 from typer.testing import CliRunner
 
 from jaxro.cli import app
