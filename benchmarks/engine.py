@@ -17,8 +17,8 @@ import numpy as np
 
 import jaxro
 from jaxro.geometry import coplanarity
-from jaxro.orientation import starts
 from jaxro.orientation.orient import orient_near
+from jaxro.orientation.problem import Problem
 from jaxro.xla.programs import QUICKEST, known, prompt, whole
 
 from . import peers
@@ -225,7 +225,7 @@ def latencies(calls: int) -> dict[str, float]:
     the compiled function inside `orient`, for the pose as peers return it and for the
     whole Orientation, then `orient` and `jit(orient)`."""
     pair = jax.device_put(pair_of(tuple(c[0] for c in aerial(1, 16))))
-    near = partial(orient_near, start=starts.Auto())
+    near = partial(orient_near, problem=Problem())
     ways: dict[str, Callable] = {
         "compiled function, pose": prompt(
             whole(lambda pair: near(pair)[0].pose), known(QUICKEST)

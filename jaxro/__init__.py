@@ -78,7 +78,8 @@ from .geometry.pairs import (
     unstack as unstack,
 )
 from .orientation import planes as planes, starts as starts
-from .orientation.orient import Orientation as Orientation, orient as orient
+from .orientation.orient import orient as orient
+from .orientation.result import Orientation as Orientation
 from .orientation.results import RESULTS as RESULTS, is_usable as is_usable
 
 __version__ = "0.1.0"

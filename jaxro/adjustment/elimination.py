@@ -21,7 +21,8 @@ from jaxtyping import Array, Float, Int
 
 from ..xla.programs import traced
 from . import normal_equations as normal, symmetric
-from .terms import Families, Linearised, Term, dimension, members
+from .blocks import Families, Linearised, dimension, members
+from .terms import Term
 
 Matrix = Float[Array, "kept kept"]
 Vector = Float[Array, " kept"]

@@ -10,22 +10,22 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from . import elimination, normal_equations as normal
+from .blocks import (
+    Families,
+    Linearised,
+    Steps,
+    close_blocks,
+    linearise,
+    move,
+    normalise,
+    residuals,
+)
 from .elimination import Layout, Solution
 from .guarded import root, times
 from .losses import AbstractLoss
 from .m_estimates import spread
 from .results import RESULTS
-from .terms import (
-    Families,
-    Linearised,
-    Steps,
-    Term,
-    closed,
-    linearised,
-    moved,
-    residuals,
-    standard,
-)
+from .terms import Term
 
 
 class JointAdjustment(eqx.Module):
@@ -83,7 +83,7 @@ class Joint(eqx.Module):
 
     def correction(self, steps: Steps) -> Steps:
         """What Gauss-Newton subtracts from the displacements."""
-        found = self.solved(steps, self.linearised(steps), self.loss)
+        found = self.solve(steps, self.linearise(steps), self.loss)
         blocks = found.eliminated
         return self.layout.divided(found.step, None if blocks is None else blocks.steps)
 
@@ -91,10 +91,10 @@ class Joint(eqx.Module):
         """The displacements followed by a step."""
         return jax.tree.map(jnp.add, steps, step)
 
-    def linearised(self, steps: Steps) -> list[Linearised]:
-        return [linearised(term, self.families, steps) for term in self.terms]
+    def linearise(self, steps: Steps) -> list[Linearised]:
+        return [linearise(term, self.families, steps) for term in self.terms]
 
-    def solved(
+    def solve(
         self, steps: Steps, parts: list[Linearised], loss: AbstractLoss | None
     ) -> Solution:
         """The solution of the normal equations with the weights of a loss."""
@@ -110,7 +110,7 @@ class Joint(eqx.Module):
         def of_kept(kept):
             steps = self.layout.divided(kept, None)
             families = {
-                b.name: moved(self.families[b.name], steps[b.name])
+                b.name: move(self.families[b.name], steps[b.name])
                 for b in self.layout.kept
             }
             return jnp.atleast_1d(self.constraints(families))  # pyright: ignore[reportOptionalCall]
@@ -135,11 +135,10 @@ def adjust_jointly(
     families = {
         name: jax.tree.map(jnp.asarray, family) for name, family in start.items()
     }
-    families = jax.lax.stop_gradient(
-        families
-    )  # the optimum does not depend on where it is sought
+    # the optimum does not depend on where it is sought
+    families = jax.lax.stop_gradient(families)
     layout = elimination.layout(families, terms, eliminate)
-    terms = tuple(closed(term, families) for term in terms)
+    terms = tuple(close_blocks(term, families) for term in terms)
     joint = Joint(terms, families, layout, constraints, loss)
     origin = {
         block.name: jnp.zeros((block.members, block.size), float)
@@ -147,7 +146,7 @@ def adjust_jointly(
     }
     found = normal.minimise(joint, origin, solver, max_steps)
     solved = {
-        name: standard(moved(families[name], step))
+        name: normalise(move(families[name], step))
         for name, step in found.value.items()
     }
     at_solution = Joint(terms, solved, layout, constraints, loss)
@@ -165,8 +164,8 @@ def _read(
     """Everything that follows from the linearisation at the solution, from which these
     steps are none."""
     layout, terms, loss = joint.layout, joint.terms, joint.loss
-    parts = joint.linearised(steps)
-    weighted = joint.solved(steps, parts, loss)
+    parts = joint.linearise(steps)
+    weighted = joint.solve(steps, parts, loss)
     rows = jnp.concatenate([part.residuals.reshape(-1) for part in parts])
     use = jnp.concatenate(
         [
@@ -187,7 +186,7 @@ def _read(
             loss, rows, use.astype(rows.dtype), layout.total - known
         )
         factor = jnp.where(checked, factor, 1.0)
-        plain = joint.solved(steps, parts, None)
+        plain = joint.solve(steps, parts, None)
         blocks = plain.eliminated
         blocks = (
             None if blocks is None else blocks._replace(inverse=factor * blocks.inverse)

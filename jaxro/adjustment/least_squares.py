@@ -11,7 +11,7 @@ the radius of curvature).
 """
 
 from collections.abc import Callable, Sequence
-from typing import overload
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,13 +24,13 @@ from ..xla.pointwise import pointwise
 from ..xla.programs import part
 from . import normal_equations as normal
 from .guarded import root, times
-from .joint import JointAdjustment, adjust_jointly
+from .joint import adjust_jointly
 from .losses import AbstractLoss
 from .m_estimates import spread
 from .parameters import as_given, as_parameters
-from .residuals import Residuals, residuals_of, reweighted, together
+from .residuals import Residuals, reweight, together
 from .results import RESULTS
-from .terms import Families, Term
+from .terms import Term, close
 
 
 class Adjustment(eqx.Module):
@@ -60,152 +60,102 @@ class Adjustment(eqx.Module):
         )
 
 
-@overload
 def adjust(
-    condition: Callable,
+    terms: Term | Sequence[Term],
     start: PyTree,
-    observations: PyTree,
-    cofactor: PyTree,
-    mask: Bool[Array, " group"] | None = None,
-    *,
-    prepare: Callable | None = None,
-    loss: AbstractLoss | None = None,
-    solver: optx.AbstractLeastSquaresSolver | None = None,
-    max_steps: int = 30,
-) -> Adjustment: ...
-
-
-@overload
-def adjust(
-    condition: Term | Sequence[Term],
-    start: Families,
     *,
     eliminate: str | None = None,
     constraints: Callable | None = None,
     loss: AbstractLoss | None = None,
     solver: optx.AbstractLeastSquaresSolver | None = None,
     max_steps: int = 30,
-) -> JointAdjustment: ...
-
-
-def adjust(
-    condition,
-    start,
-    observations=None,
-    cofactor=None,
-    mask=None,
-    *,
-    prepare: Callable | None = None,
-    eliminate: str | None = None,
-    constraints: Callable | None = None,
-    loss: AbstractLoss | None = None,
-    solver: optx.AbstractLeastSquaresSolver | None = None,
-    max_steps: int = 30,
-) -> Adjustment | JointAdjustment:
+) -> Any:
     """Adjust parameters to measurements: Σ |L_i⁻¹ g(x, l_i)|² = min, or Σ rho of it
     with a robust loss.
 
-    `condition(parameters, observation)` of one group returns a number or m of them.
-    `observations`: a pytree whose leaves have the groups on the first axis; `cofactor`:
-    its variances (relative to sigma0²), a tree that may end above the leaves and then
-    holds for all of them: numbers or one per group, None for what is free of error.
-    `mask` selects groups. `start`: `AbstractParameters`, or any pytree of numbers.
-    `prepare`: what all groups share, computed once; the condition then gets
-    prepare(*arguments) for the parameters, of their `arguments`. `solver`: any
-    optimistix least-squares solver; `GaussNewton()` if None.
+    `terms`: one `Term`, or several kinds of conditions. `start`: `AbstractParameters`
+    or any tree of numbers; the result then is an `Adjustment`. If the terms touch
+    blocks of parameters (cameras, object points), `start` has the families of blocks by
+    name, and the result is a `JointAdjustment`.
+
+    `eliminate` names the family with the most blocks, if no condition joins two of
+    them; only its Schur complement is then inverted. `constraints(parameters)`: numbers
+    of the kept families that are to become zero, as the datum of a free network.
+    `solver`: any optimistix least-squares solver; `GaussNewton()` if None.
 
     With a loss, normal matrix and redundancy carry the final weights rho'(r²); sigma0
     is consistent for normal errors, and sigma0² times `cofactor` is the sandwich
     covariance of the M-estimate (`m_estimates`), so that the cofactors are not the
     inverse of the normal matrix. Derivatives of every field by the observations and
     cofactors are exact (implicit function theorem). Failures are values of `result`,
-    never exceptions.
-
-    Several kinds of conditions between many blocks of parameters (cameras, object
-    points): `adjust(terms, start)` with a list of `Term` in place of the condition, and
-    with the families of blocks by name as `start`. `eliminate` names the family with
-    the most blocks, if no condition joins two of them; only its Schur complement is
-    then inverted. `constraints(parameters)`: numbers of the kept families that are to
-    become zero, as the datum of a free network.
+    never exceptions; ValueError for terms that do not go together.
     """
-    if isinstance(condition, Term | Sequence):
-        if any(given is not None for given in (observations, cofactor, mask, prepare)):
-            raise ValueError(
-                "adjust: observations, cofactors and masks are part of each `Term`; "
-                "there is no `prepare`"
-            )
-        terms = (condition,) if isinstance(condition, Term) else tuple(condition)
+    terms = (terms,) if isinstance(terms, Term) else tuple(terms)
+    how = {"loss": loss, "solver": solver, "max_steps": max_steps}
+    if terms and all(term.touches for term in terms):
         return adjust_jointly(
-            terms,
-            start,
-            eliminate=eliminate,
-            constraints=constraints,
-            loss=loss,
-            solver=solver,
-            max_steps=max_steps,
+            terms, start, eliminate=eliminate, constraints=constraints, **how
         )
-    if eliminate is not None or constraints is not None:
+    if len(terms) != 1 or eliminate is not None or constraints is not None:
         raise ValueError(
-            "adjust: `eliminate` and `constraints` are for terms; give `Term`s in "
-            "place of the condition"
+            "adjust: several terms, `eliminate` and `constraints` are for parameters "
+            "in blocks; name the blocks of every term in its `touches`"
         )
     if as_parameters(start).count > normal.UNROLLED:
-        measured = condition, prepare, observations, cofactor, mask
-        return _of_one_block(
-            *measured, start, loss=loss, solver=solver, max_steps=max_steps
-        )
-    groups = jax.tree.leaves(observations)[0].shape[0]
-    if mask is None:
-        mask = jnp.ones(groups, bool)
+        return _adjust_as_block(terms[0], start, **how)
+    return _adjust_unrolled(terms[0], start, **how)
+
+
+def _adjust_unrolled(
+    term: Term,
+    start: PyTree,
+    *,
+    loss: AbstractLoss | None,
+    solver: optx.AbstractLeastSquaresSolver | None,
+    max_steps: int,
+) -> Adjustment:
+    """A few parameters, whose normal equations are written out."""
+    # the optimum does not depend on where it is sought
+    start = as_parameters(jax.lax.stop_gradient(start))
+    called_with = (as_given(start),) if term.prepare is None else start.arguments()
+    residuals = Residuals(close(term, *called_with), start, loss)
     dtype = jax.tree.leaves(start)[0].dtype
-    cofactor = jax.tree.map(
-        lambda q: jnp.broadcast_to(jnp.asarray(q, dtype), (groups, *jnp.shape(q)[1:])),
-        cofactor,
-    )
-    start = as_parameters(
-        jax.lax.stop_gradient(start)
-    )  # the optimum does not depend on where it is sought
-    residuals = residuals_of(
-        condition, prepare, start, observations, cofactor, mask, loss
-    )
     origin = (jnp.zeros((), dtype),) * start.count
     solve = lambda origin, residuals: normal.minimise(
         residuals, origin, solver, max_steps
     )
     solution = part(solve)(origin, residuals)
-    parameters = start.moved(solution.value).normalised()
+    solved = start.moved(solution.value).normalised()
     converged = solution.result == optx.RESULTS.successful
-    at_solution = eqx.tree_at(
-        lambda r: (r.centre, r.loss),
-        residuals,
-        (parameters, None),
-        is_leaf=lambda leaf: leaf is None,
-    )
+    at_solution = Residuals(residuals.term, solved)
     return read(at_solution, loss, solution.stats["num_steps"], converged)
 
 
-def _of_one_block(
-    condition, prepare, observations, cofactor, mask, start, **options
-) -> Adjustment:
+def _adjust_as_block(term: Term, start: PyTree, **how) -> Adjustment:
     """Many parameters, all of which every group touches, as one block."""
 
     def of_block(parameters, observation):
-        arguments = as_parameters(parameters).arguments()
-        return condition(
-            parameters if prepare is None else prepare(*arguments), observation
-        )
+        if term.prepare is None:
+            return term.condition(parameters, observation)
+        shared = term.prepare(*as_parameters(parameters).arguments())
+        return term.condition(shared, observation)
 
-    term = Term(of_block, observations, cofactor, [("all", np.zeros((), int))], mask)
-    found = adjust_jointly(
-        (term,), {"all": jax.tree.map(lambda a: jnp.asarray(a)[None], start)}, **options
+    touching = Term(
+        of_block,
+        term.observations,
+        term.cofactor,
+        touches=[("all", np.zeros((), int))],
+        mask=term.mask,
     )
-    one = lambda a: a[:, 0] if a.shape[1] == 1 else a
+    family = jax.tree.map(lambda a: jnp.asarray(a)[None], start)
+    found = adjust_jointly((touching,), {"all": family}, **how)
+    of_group = lambda a: a[:, 0] if a.shape[1] == 1 else a
     return Adjustment(
         parameters=jax.tree.map(lambda a: a[0], found.parameters["all"]),
         normal_matrix=found.normal_matrix,
         cofactor=found.cofactor,
-        residuals=one(found.residuals[0]),
-        redundancy=one(found.redundancy[0]),
+        residuals=of_group(found.residuals[0]),
+        redundancy=of_group(found.redundancy[0]),
         sigma0=found.sigma0,
         pivot=found.pivot,
         degrees_of_freedom=found.degrees_of_freedom,
@@ -215,65 +165,71 @@ def _of_one_block(
 
 
 def read(
-    residuals: Residuals, loss: AbstractLoss | None, iterations, converged
+    residuals: Residuals,
+    loss: AbstractLoss | None,
+    iterations: Int[Array, ""],
+    converged: Bool[Array, ""],
 ) -> Adjustment:
     """Everything that follows from the linearisation at the solution, the centre of
     `residuals`."""
     p = residuals.centre.count
+    mask = residuals.term.mask
     origin = (jnp.zeros((), jax.tree.leaves(residuals.centre)[0].dtype),) * p
-    linearised = residuals.linearised(origin)
-    groups = residuals.observations, residuals.cofactor, residuals.mask
-    r, jacobian, weight = jax.vmap(linearised)(*groups)
+    linearise = residuals.linearise(origin)
+    r, jacobian, weight = jax.vmap(linearise)(*residuals.of_groups)
     n, _, squares, number = normal.accumulate(
-        r, jacobian, reweighted(loss, r, weight), residuals.mask.astype(origin[0].dtype)
+        r, jacobian, reweight(loss, r, weight), mask.astype(origin[0].dtype)
     )
     q, pivot = normal.inverse(n)
 
     def of_group(observation, cofactor, use):
-        r, jacobian, weight = linearised(observation, cofactor, use)
-        white = (
-            r
-            if weight is None
-            else [e * jnp.sqrt(w) for e, w in zip(r, weight, strict=True)]
-        )
-        weight = reweighted(loss, r, weight)
-        taken = [
-            normal.quadratic(q, [column[c] for column in jacobian])
-            for c in range(len(r))
-        ]
-        redundancy = [
-            1 - (t if weight is None else weight[c] * t) for c, t in enumerate(taken)
-        ]
-        return [
-            [jnp.where(use, entry, 0.0) for entry in entries]
-            for entries in (white, redundancy)
-        ]
+        r, jacobian, weight = linearise(observation, cofactor, use)
+        white = _times_roots(r, weight)
+        redundancy = _redundancies(q, jacobian, reweight(loss, r, weight))
+        used = lambda entries: [jnp.where(use, entry, 0.0) for entry in entries]
+        return used(white), used(redundancy)
 
-    white, redundancy = pointwise(of_group, *groups)
+    white, redundancy = pointwise(of_group, *residuals.of_groups)
     freedom = len(r) * number.astype(int) - p
     checked = freedom > 0
     cofactor = normal.dense(q)
     if loss is None:
-        sigma0 = root(squares / jnp.where(checked, freedom, 1).astype(origin[0].dtype))
+        divisor = jnp.where(checked, freedom, 1).astype(origin[0].dtype)
+        sigma0 = root(squares / divisor)
     else:
         entries = jnp.concatenate(white)
-        use = jnp.tile(residuals.mask.astype(entries.dtype), len(white))
+        use = jnp.tile(mask.astype(entries.dtype), len(white))
         sigma0, factor = spread(loss, entries, use, p)
-        plain, *_ = normal.accumulate(r, jacobian, weight)
-        cofactor = jnp.where(checked, factor, 1.0) * normal.dense(
-            normal.inverse(plain)[0]
-        )
+        unweighted, *_ = normal.accumulate(r, jacobian, weight)
+        plain = normal.dense(normal.inverse(unweighted)[0])
+        cofactor = jnp.where(checked, factor, 1.0) * plain
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.diverged)
     result = RESULTS.where(pivot < normal.SINGULAR, RESULTS.rank_deficient, result)
     return Adjustment(
-        as_given(residuals.centre),
-        normal.dense(n),
-        cofactor,
-        together(white),
-        together(redundancy),
-        jnp.where(checked, sigma0, jnp.nan),
-        pivot,
-        freedom,
-        iterations,
-        result,
+        parameters=as_given(residuals.centre),
+        normal_matrix=normal.dense(n),
+        cofactor=cofactor,
+        residuals=together(white),
+        redundancy=together(redundancy),
+        sigma0=jnp.where(checked, sigma0, jnp.nan),
+        pivot=pivot,
+        degrees_of_freedom=freedom,
+        iterations=iterations,
+        result=result,
     )
+
+
+def _times_roots(r: list, weight: list | None) -> list:
+    """Residuals times the roots of their weights."""
+    if weight is None:
+        return r
+    return [entry * jnp.sqrt(w) for entry, w in zip(r, weight, strict=True)]
+
+
+def _redundancies(q: normal.Lower, jacobian: list, weight: list | None) -> list:
+    """1 - w a Q aᵀ of the m conditions of a group."""
+    out = []
+    for c in range(len(jacobian[0])):
+        taken = normal.quadratic(q, [column[c] for column in jacobian])
+        out.append(1 - (taken if weight is None else weight[c] * taken))
+    return out

@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .normal_equations import slopes
@@ -29,7 +30,7 @@ class AbstractParameters(eqx.Module):
         """The number of local parameters."""
 
     @abc.abstractmethod
-    def moved(self, step: Step) -> "AbstractParameters":
+    def moved(self, step: Step | Float[Array, " count"]) -> "AbstractParameters":
         """The parameters after a small step."""
 
     def normalised(self) -> "AbstractParameters":
@@ -59,21 +60,9 @@ class Numbers(AbstractParameters):
     def count(self) -> int:
         return sum(jnp.size(leaf) for leaf in jax.tree.leaves(self.values))
 
-    def moved(self, step: Step) -> "Numbers":
-        leaves, structure = jax.tree.flatten(self.values)
-        rest, out = list(step), []
-        for leaf in leaves:
-            size = jnp.size(leaf)
-            out.append(
-                leaf
-                + (
-                    rest[0]
-                    if jnp.ndim(leaf) == 0
-                    else jnp.stack(rest[:size]).reshape(jnp.shape(leaf))
-                )
-            )
-            rest = rest[size:]
-        return Numbers(jax.tree.unflatten(structure, out))
+    def moved(self, step: Step | Float[Array, " count"]) -> "Numbers":
+        flat, unravel = ravel_pytree(self.values)
+        return Numbers(unravel(flat + jnp.asarray(step)))
 
     def arguments(self) -> tuple:
         return (self.values,)

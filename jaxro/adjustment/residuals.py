@@ -1,9 +1,5 @@
-"""The whitened residuals of any condition between parameters and measurements, and
-their derivatives.
-
-Each group of conditions g(x, l) = 0 is linearised by autodiff, B = dg/dl, and whitened
-by the Cholesky factor of its cofactor B Q Bᵀ.
-"""
+"""The whitened residuals of a term as a function of all parameters, and their
+derivatives."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,105 +12,31 @@ from jaxtyping import Array, Bool, Float, PyTree
 from . import normal_equations as normal
 from .losses import AbstractLoss
 from .parameters import AbstractParameters, as_given
-
-
-def discrepancy(
-    condition: Callable, parameters: PyTree, observation: PyTree, cofactor: PyTree, use
-):
-    """The m entries of g of one group, and the lower triangle of B Q Bᵀ (the unit
-    matrix where it is not used).
-
-    A cofactor stands for every entry of its part of the observation; entries whose
-    cofactor is None are free of error.
-    """
-    known = jax.tree.map(
-        lambda q, part: jax.tree.map(lambda _: q is not None, part),
-        cofactor,
-        observation,
-        is_leaf=_none,
-    )
-    measured, exact = eqx.partition(observation, known)
-
-    def values(measured):
-        g = condition(parameters, eqx.combine(measured, exact))
-        return [g] if jnp.ndim(g) == 0 else [g[k] for k in range(g.shape[0])]
-
-    g, pull = jax.vjp(values, measured)
-    one, zero = jnp.ones_like(g[0]), jnp.zeros_like(g[0])
-    rows = [
-        pull([one if j == k else zero for j in range(len(g))])[0] for k in range(len(g))
-    ]
-
-    def product(a: PyTree, b: PyTree):
-        """a Q bᵀ; one product by a variance that several entries share."""
-        part = lambda q, x, y: None if q is None else q * _dot(x, y, jnp.shape(q))
-        return sum(
-            jnp.sum(t)
-            for t in jax.tree.leaves(jax.tree.map(part, cofactor, a, b, is_leaf=_none))
-        )
-
-    d = [[product(rows[i], rows[j]) for j in range(i + 1)] for i in range(len(g))]
-    for i in range(len(g)):  # a masked group must not divide by its own zero
-        d[i][i] = jnp.where(use, d[i][i], one)
-    return g, d
-
-
-def _none(leaf) -> bool:
-    return leaf is None
-
-
-def _dot(a: PyTree, b: PyTree, shape: tuple[int, ...]):
-    """Sum of the products of two trees of entries, each reduced to the shape of their
-    cofactor."""
-    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    return sum(x * y if jnp.shape(x) == shape else jnp.sum(x * y) for x, y in pairs)
-
-
-def whitened(g: list, d: list, use) -> list:
-    """The m entries of L⁻¹ g of one group, L Lᵀ = B Q Bᵀ; zero where the group is not
-    used."""
-    zero = jnp.zeros_like(g[0])
-    if len(g) == 1:
-        return [jnp.where(use, g[0] / jnp.sqrt(d[0][0]), zero)]
-    factor, _ = normal.cholesky(d)
-    out: list = []
-    for i, row in enumerate(factor):
-        s = g[i]
-        for k in range(i):
-            s = s - row[k] * out[k]
-        out.append(jnp.where(use, s * row[i], zero))
-    return out
+from .terms import Term, discrepancy, whiten
 
 
 class Residuals(eqx.Module):
-    """The whitened residuals of all groups as a function of a displacement x of the
+    """The whitened residuals of a term as a function of a displacement x of all
     parameters from `centre`.
 
-    What the groups share is computed once by `prepare` of the `arguments` of the
-    parameters; its few numbers θ are what a group's condition sees. Without it that
-    sees the parameters.
+    θ is what the condition of a group is called with: what `term.prepare` makes of the
+    `arguments` of the parameters, or the parameters themselves.
     """
 
-    prepare: Callable | None
-    condition: Callable
+    term: Term
     centre: AbstractParameters
-    observations: PyTree
-    cofactor: PyTree
-    mask: Bool[Array, " group"]
     loss: AbstractLoss | None = None
 
     def shared(self, *x: Array) -> PyTree:
         """θ(x): what `prepare` makes of the parameters, or the parameters
         themselves."""
         parameters = self.centre.moved(x)
-        return (
-            as_given(parameters)
-            if self.prepare is None
-            else self.prepared(*parameters.arguments())
-        )
+        if self.term.prepare is None:
+            return as_given(parameters)
+        return self._prepare(*parameters.arguments())
 
-    def prepared(self, *arguments) -> PyTree:
-        return jax.tree.map(jnp.asarray, self.prepare(*arguments))  # pyright: ignore[reportOptionalCall]
+    def _prepare(self, *arguments) -> PyTree:
+        return jax.tree.map(jnp.asarray, self.term.prepare(*arguments))  # pyright: ignore[reportOptionalCall]
 
     def correction(self, x: tuple[Array, ...]) -> tuple[Array, ...]:
         """What Gauss-Newton subtracts from the displacement."""
@@ -125,20 +47,25 @@ class Residuals(eqx.Module):
     ) -> tuple[Array, ...]:
         """The displacement x followed by a step, which has the directions of
         `columns`."""
-        if self.prepare is None:
+        if self.term.prepare is None:
             return tuple(a + b for a, b in zip(x, step, strict=True))
         return self.centre.further(x, step)
+
+    @property
+    def of_groups(self) -> tuple[PyTree, PyTree, Bool[Array, " group"]]:
+        """Observations, cofactors and mask, group by group."""
+        return self.term.observations, self.term.cofactor, self.term.mask
 
     def groups(self, function: Callable, theta: PyTree) -> Any:
         """function(g, B Q Bᵀ, use) of every group."""
         one = lambda l, q, use: function(
-            *discrepancy(self.condition, theta, l, q, use), use
+            *discrepancy(self.term.condition, theta, l, q, use), use
         )
-        return jax.vmap(one)(self.observations, self.cofactor, self.mask)
+        return jax.vmap(one)(*self.of_groups)
 
     def residuals(self, g: list, d: list, use) -> list:
         """The m whitened (and, with a loss, transformed) residuals of one group."""
-        r = whitened(g, d, use)
+        r = whiten(g, d, use)
         return r if self.loss is None else [self.loss.transformed(entry) for entry in r]
 
     def __call__(
@@ -151,12 +78,10 @@ class Residuals(eqx.Module):
     ) -> tuple[list[Array], Sequence[Sequence[Any]], list[Array] | None]:
         """The m residual arrays, for each direction at x the m arrays of its column,
         and the weights of both."""
-        r, columns, weight = jax.vmap(self.linearised(x))(
-            self.observations, self.cofactor, self.mask
-        )
-        return r, columns, reweighted(self.loss, r, weight)
+        r, columns, weight = jax.vmap(self.linearise(x))(*self.of_groups)
+        return r, columns, reweight(self.loss, r, weight)
 
-    def linearised(self, x: tuple[Array, ...]) -> Callable:
+    def linearise(self, x: tuple[Array, ...]) -> Callable:
         """A function of a group's observation, its cofactors and whether it is used:
         the m residuals at x, for each direction the m entries of its column, and the
         weights of both but for a loss.
@@ -167,18 +92,18 @@ class Residuals(eqx.Module):
         are those of iteratively reweighted least squares, which do not overshoot as
         those of the transformed residual may.
         """
-        if self.prepare is None:
+        if self.term.prepare is None:
             theta, along = normal.slopes(self.shared, x)
         else:
-            theta, along = self.centre.slopes(self.prepared, x)
+            theta, along = self.centre.slopes(self._prepare, x)
 
         def one(observation, cofactor, use):
             at = lambda theta: discrepancy(
-                self.condition, theta, observation, cofactor, use
+                self.term.condition, theta, observation, cofactor, use
             )
             (g, d), pull = jax.vjp(at, theta)
             if len(g) > 1:
-                r, push = jax.linearize(lambda theta: whitened(*at(theta), use), theta)
+                r, push = jax.linearize(lambda theta: whiten(*at(theta), use), theta)
                 full = lambda entry, slope: (
                     jnp.zeros_like(entry) if slope is None else slope
                 )
@@ -194,7 +119,7 @@ class Residuals(eqx.Module):
         return one
 
 
-def reweighted(
+def reweight(
     loss: AbstractLoss | None, r: list[Array], weight: list[Array] | None
 ) -> list[Array] | None:
     """The weights w (None: 1) of residuals r, times rho'(w r²) of the loss."""
@@ -208,20 +133,3 @@ def reweighted(
 def together(entries: list) -> Float[Array, " group"] | Float[Array, "group m"]:
     """The m arrays of all groups as one."""
     return entries[0] if len(entries) == 1 else jnp.stack(entries, axis=1)
-
-
-def residuals_of(
-    condition, prepare, centre, observations, cofactor, mask, loss=None
-) -> Residuals:
-    """`Residuals` whose functions carry what they close over as arguments, so that it
-    can be differentiated."""
-    if prepare is not None:
-        prepare = eqx.filter_closure_convert(prepare, *centre.arguments())
-        prepared = jax.eval_shape(prepare, *centre.arguments())
-    else:
-        prepared = as_given(centre)
-    first = jax.tree.map(
-        lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), observations
-    )
-    condition = eqx.filter_closure_convert(condition, prepared, first)
-    return Residuals(prepare, condition, centre, observations, cofactor, mask, loss)

@@ -1,36 +1,35 @@
-"""Conditions of several kinds between blocks of parameters and measurements.
+"""One kind of condition, and what is measured for it.
 
-A block is a member of a family: one of all cameras, one of all object points. A `Term`
-is one kind of condition and what is measured for it; each of its groups touches a few
-blocks. Only the derivatives by these are ever computed.
+    g(parameters, l + v) = 0  for every group of observations l
+
+Each group is linearised by autodiff, B = dg/dl, and whitened by the Cholesky factor of
+its cofactor B Q Bᵀ.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
-from .parameters import AbstractParameters, as_parameters
-from .residuals import discrepancy, whitened
-
-Families = Mapping[str, Any]
-"""Parameters by the name of their family: `AbstractParameters` or trees of numbers,
-members on the first axis."""
-
-Steps = dict[str, Float[Array, "member d"]]
-"""A displacement of every member of every family."""
+from . import normal_equations as normal
 
 
 class Term(eqx.Module):
-    """One kind of condition: g(blocks, l + v) = 0 for each of its groups.
+    """One kind of condition: g(parameters, l + v) = 0 for each of its groups.
 
-    `condition(*blocks, observation)` of one group returns a number or m of them.
-    `touches`: for each block that it is called with, the family and the member of every
-    group, (group,). `observations`, `cofactor`, `mask`: as in `adjust`.
+    `condition(*parameters, observation)` of one group returns a number or m of them.
+    `observations`: a tree whose leaves have the groups on the first axis. `cofactor`:
+    its variances (relative to sigma0²), a tree that may end above the leaves and then
+    holds for all of them: numbers or one per group, None for what is free of error.
+    `mask` selects groups (all, if None).
+
+    `touches` names the blocks of parameters that the condition is called with: for
+    each of them the family and the member of every group, (group,). Without it the
+    condition is called with all parameters. `prepare`: what all groups share, computed
+    once from the `arguments` of the parameters; the condition is then called with its
+    result.
     """
 
     condition: Callable
@@ -38,16 +37,22 @@ class Term(eqx.Module):
     cofactor: PyTree
     touches: tuple[tuple[str, Int[Array, " group"]], ...]
     mask: Bool[Array, " group"]
+    prepare: Callable | None
 
     def __init__(
         self,
         condition: Callable,
         observations: PyTree,
         cofactor: PyTree,
-        touches: Sequence[tuple[str, Int[ArrayLike, "..."]]],
+        *,
+        touches: Sequence[tuple[str, Int[ArrayLike, "..."]]] = (),
         mask: ArrayLike | None = None,
+        prepare: Callable | None = None,
     ):
+        if touches and prepare is not None:
+            raise ValueError("Term: what blocks share cannot be prepared")
         self.condition = condition
+        self.prepare = prepare
         self.observations = jax.tree.map(jnp.asarray, observations)
         groups = jax.tree.leaves(self.observations)[0].shape[0]
         self.touches = tuple(
@@ -55,97 +60,99 @@ class Term(eqx.Module):
             for name, member in touches
         )
         self.mask = jnp.ones(groups, bool) if mask is None else jnp.asarray(mask)
-        every = lambda q: jnp.broadcast_to(
-            jnp.asarray(q, float), (groups, *jnp.shape(q)[1:])
-        )
-        self.cofactor = jax.tree.map(every, cofactor)
+        self.cofactor = jax.tree.map(lambda q: _for_each(q, groups), cofactor)
 
 
-class Linearised(eqx.Module):
-    """A term at given parameters: the m whitened residuals of each group, and their
-    derivatives by the local parameters of each block that it touches; zero where the
-    group is not used."""
-
-    residuals: Float[Array, "group m"]
-    columns: tuple[Float[Array, "group m _"], ...]
+def _for_each(q: ArrayLike, groups: int) -> Array:
+    """A variance of every group, from one for all or one for each."""
+    q = jnp.asarray(q)
+    q = q if jnp.issubdtype(q.dtype, jnp.floating) else q.astype(float)
+    return jnp.broadcast_to(q, (groups, *q.shape[1:]))
 
 
-def closed(term: Term, families: Families) -> Term:
-    """The term with a condition that carries what it closes over, so that it can be
-    differentiated by that, too."""
-    shape = lambda a: jax.ShapeDtypeStruct(jnp.shape(a)[1:], jnp.result_type(a))
-    blocks = (jax.tree.map(shape, families[name]) for name, _ in term.touches)
-    condition = eqx.filter_closure_convert(
-        term.condition, *blocks, jax.tree.map(shape, term.observations)
+def close(term: Term, *parameters: PyTree) -> Term:
+    """The term with functions that carry what they close over as arrays of their own,
+    so that an adjustment can be differentiated by these, too.
+
+    `parameters`: what `prepare`, or else the condition, is called with (shapes are
+    enough).
+    """
+    prepare = term.prepare
+    if prepare is not None:
+        prepare = eqx.filter_closure_convert(prepare, *parameters)
+        parameters = (jax.eval_shape(prepare, *parameters),)
+    first = jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), term.observations
     )
-    return eqx.tree_at(lambda t: t.condition, term, condition)
+    condition = eqx.filter_closure_convert(term.condition, *parameters, first)
+    functions = lambda t: (t.condition, t.prepare)
+    none = lambda leaf: leaf is None
+    return eqx.tree_at(functions, term, (condition, prepare), is_leaf=none)
 
 
-def members(family: Any) -> int:
-    """How many blocks a family has."""
-    return jax.tree.leaves(family)[0].shape[0]
+def discrepancy(
+    condition: Callable, parameters: PyTree, observation: PyTree, cofactor: PyTree, use
+):
+    """The m entries of g of one group, and the lower triangle of B Q Bᵀ (the unit
+    matrix where it is not used).
 
-
-def dimension(family: Any) -> int:
-    """How many local parameters each block of a family has."""
-    return as_parameters(jax.tree.map(lambda a: a[0], family)).count
-
-
-def moved(family: Any, steps: Float[Array, "member d"]) -> Any:
-    """All members of a family, displaced."""
-    return jax.vmap(_moved)(family, steps)
-
-
-def standard(family: Any) -> Any:
-    """All members of a family in their standard form."""
-    return (
-        jax.vmap(lambda block: block.normalised())(family)
-        if isinstance(family, AbstractParameters)
-        else family
+    A cofactor stands for every entry of its part of the observation; entries whose
+    cofactor is None are free of error.
+    """
+    known = jax.tree.map(
+        lambda q, part: jax.tree.map(lambda _: q is not None, part),
+        cofactor,
+        observation,
+        is_leaf=_none,
     )
+    measured, exact = eqx.partition(observation, known)
 
+    def values(measured):
+        g = condition(parameters, eqx.combine(measured, exact))
+        return [g] if jnp.ndim(g) == 0 else [g[k] for k in range(g.shape[0])]
 
-def _moved(block: Any, step: Float[Array, " d"]) -> Any:
-    if isinstance(block, AbstractParameters):
-        return block.moved(tuple(step[k] for k in range(step.shape[0])))
-    flat, unravel = ravel_pytree(block)
-    return unravel(flat + step)
+    g, pull = jax.vjp(values, measured)
+    one, zero = jnp.ones_like(g[0]), jnp.zeros_like(g[0])
+    rows = [
+        pull([one if j == k else zero for j in range(len(g))])[0] for k in range(len(g))
+    ]
 
-
-def residuals(term: Term, families: Families, steps: Steps) -> Float[Array, "group m"]:
-    """The whitened residuals of a term for displaced families."""
-    return jax.vmap(_of_group(term))(*_parts(term, families, steps))
-
-
-def linearised(term: Term, families: Families, steps: Steps) -> Linearised:
-    """`Linearised` for displaced families."""
-    one = _of_group(term)
-
-    def group(observation, cofactor, use, blocks, local):
-        of = lambda local: one(observation, cofactor, use, blocks, local)
-        return of(local), jax.jacfwd(of)(local)
-
-    return Linearised(*jax.vmap(group)(*_parts(term, families, steps)))
-
-
-def _parts(term: Term, families: Families, steps: Steps) -> tuple:
-    """What each group consists of: observation, cofactor, use, and its blocks with
-    their displacements."""
-    take = lambda tree, member: jax.tree.map(lambda a: a[member], tree)
-    blocks = tuple(take(families[name], member) for name, member in term.touches)
-    local = tuple(steps[name][member] for name, member in term.touches)
-    return term.observations, term.cofactor, term.mask, blocks, local
-
-
-def _of_group(term: Term) -> Callable:
-    """The whitened residuals of one group, as a function of its parts."""
-    condition = lambda blocks, observation: term.condition(*blocks, observation)
-
-    def one(observation, cofactor, use, blocks, local):
-        displaced = tuple(
-            _moved(block, step) for block, step in zip(blocks, local, strict=True)
+    def product(a: PyTree, b: PyTree):
+        """a Q bᵀ; one product by a variance that several entries share."""
+        part = lambda q, x, y: None if q is None else q * _dot(x, y, jnp.shape(q))
+        return sum(
+            jnp.sum(t)
+            for t in jax.tree.leaves(jax.tree.map(part, cofactor, a, b, is_leaf=_none))
         )
-        g, d = discrepancy(condition, displaced, observation, cofactor, use)
-        return jnp.stack(whitened(g, d, use))
 
-    return one
+    d = [[product(rows[i], rows[j]) for j in range(i + 1)] for i in range(len(g))]
+    for i in range(len(g)):  # a masked group must not divide by its own zero
+        d[i][i] = jnp.where(use, d[i][i], one)
+    return g, d
+
+
+def _none(leaf) -> bool:
+    return leaf is None
+
+
+def _dot(a: PyTree, b: PyTree, shape: tuple[int, ...]):
+    """Sum of the products of two trees of entries, each reduced to the shape of their
+    cofactor."""
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return sum(x * y if jnp.shape(x) == shape else jnp.sum(x * y) for x, y in pairs)
+
+
+def whiten(g: list, d: list, use) -> list:
+    """The m entries of L⁻¹ g of one group, L Lᵀ = B Q Bᵀ; zero where the group is not
+    used."""
+    zero = jnp.zeros_like(g[0])
+    if len(g) == 1:
+        return [jnp.where(use, g[0] / jnp.sqrt(d[0][0]), zero)]
+    factor, _ = normal.cholesky(d)
+    out: list = []
+    for i, row in enumerate(factor):
+        s = g[i]
+        for k in range(i):
+            s = s - row[k] * out[k]
+        out.append(jnp.where(use, s * row[i], zero))
+    return out

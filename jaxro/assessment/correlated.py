@@ -15,11 +15,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..adjustment import normal_equations as normal
-from ..adjustment.residuals import Residuals
 from ..geometry import coplanarity
 from ..geometry.linear import linearised
 from ..geometry.pairs import Pair, cleaned
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 from .neighbours import agreement
 
 
@@ -45,10 +44,7 @@ def correlated_covariance(
     points.
     """
     pair = cleaned(pair)[0]
-    prepare, condition, observations, cofactor = coplanarity.rigorous(pair)
-    residuals = Residuals(
-        prepare, condition, orientation.elements, observations, cofactor, pair.mask
-    )
+    residuals = coplanarity.residuals(pair, orientation.elements)
     _, columns, weights = residuals.columns((jnp.zeros_like(pair.focal_left),) * 5)
     root = jnp.sqrt(weights[0])  # pyright: ignore[reportOptionalSubscript]
     a = jnp.stack([jnp.where(pair.mask, column * root, 0.0) for (column,) in columns])

@@ -23,7 +23,7 @@ from ..geometry.elements import (
 )
 from ..geometry.linear import Linear, Values
 from ..geometry.pairs import Coordinates, Pair
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 from ..xla.programs import stage
 from ..xla.reductions import sums
 

@@ -29,7 +29,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from ..adjustment import critical_values as critical
 from ..geometry.linear import linearised
 from ..geometry.pairs import Coordinates, Pair, cleaned
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 from .correlations import Normalised, normalised
 from .familywise import largest_w
 from .undecided import DOUBT, explaining

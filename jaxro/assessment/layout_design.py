@@ -29,7 +29,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 from ..adjustment import normal_equations as normal
 from ..adjustment.guarded import root
 from ..adjustment.least_squares import Adjustment, read
-from ..adjustment.residuals import Residuals
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import AbstractElements, DependentElements, vertical
 from ..geometry.mock_pairs import Layout, mock_pair
@@ -81,8 +80,7 @@ def planned(overlap: Overlap, positions: Positions, sigma: ArrayLike = 1.0) -> P
     """The layout of these positions, coordinates with this standard deviation."""
     pair = photographed(overlap, positions, sigma)
     centre = vertical(pair.focal_left) if overlap.elements is None else overlap.elements
-    prepare, condition, observations, cofactor = coplanarity.rigorous(pair)
-    residuals = Residuals(prepare, condition, centre, observations, cofactor, pair.mask)
+    residuals = coplanarity.residuals(pair, centre)
     return Plan(pair, read(residuals, None, jnp.asarray(0), jnp.asarray(True)), overlap)
 
 

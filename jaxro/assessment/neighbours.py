@@ -38,7 +38,7 @@ from jaxtyping import Array, Float
 
 from ..geometry.linear import Linear, linearised
 from ..geometry.pairs import Pair, cleaned
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 
 LENGTHS = (0.025, 0.05, 0.1, 0.2)
 """Correlation lengths l that are tried, in units of the side of a square as large as

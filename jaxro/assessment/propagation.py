@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from ..adjustment.guarded import root
 from ..adjustment.least_squares import Adjustment
 from ..adjustment.parameters import as_given, as_parameters
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 from ..xla.programs import traced
 from ..xla.reductions import total
 

@@ -35,7 +35,7 @@ from ..adjustment.guarded import root
 from ..adjustment.normal_equations import accumulate, inverse
 from ..geometry.linear import Linear, linearised
 from ..geometry.pairs import Coordinates, Pair, cleaned
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 from ..xla.programs import QUICK, Program, stage, traced
 from ..xla.reductions import count
 from .external_reliability import effects

@@ -24,7 +24,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ..geometry import rotations as rot
 from ..geometry.elements import AbstractElements, DependentElements, RelativePose
 from ..geometry.pairs import Pair
-from ..orientation.orient import Orientation, orient
+from ..orientation.orient import orient
+from ..orientation.result import Orientation
 from ..orientation.results import is_usable
 from ..xla.programs import QUICK, Program, traced
 from ..xla.reductions import total

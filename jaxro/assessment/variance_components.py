@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from ..adjustment import normal_equations as normal
 from ..geometry.linear import Linear, linearised
 from ..geometry.pairs import Pair, cleaned
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 from ..xla.programs import Program, traced
 from ..xla.reductions import sums, total
 

@@ -19,7 +19,9 @@ from jaxtyping import Array, PyTree
 
 from ..geometry.elements import AbstractElements
 from ..geometry.pairs import Pair, double
-from ..orientation.orient import DEFAULTS, Orientation, orient, orient_near
+from ..orientation.orient import orient_near, orient_once
+from ..orientation.problem import Problem, problem_of
+from ..orientation.result import Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
 from ..rejection.hypotheses import AbstractHypotheses
@@ -97,92 +99,73 @@ def orient_batch(
         raise ValueError(
             "select and read exclude each other; read sees the orientation, too"
         )
-    host, report, way = (
-        jax.tree.map(np.asarray, double(pairs)),
-        progress or unheard,
-        Way(threads, chunk),
-    )
-    options = settled(options | {"start": start}) | {
-        "read": Selected(select) if read is None else read
-    }
+    host, report = jax.tree.map(np.asarray, double(pairs)), progress or unheard
+    way = Way(threads, chunk)
+    problem = problem_of_all(options | {"start": start})
+    read = Selected(select) if read is None else read
     if not isinstance(start, Auto):
-        return _finish(oriented(host, options, way, report))
-    out, fits = oriented_near(host, options, way, report)
+        return _finish(orient_slabs(host, problem, read, way, report))
+    out, fits = orient_slabs_near(host, problem, read, way, report)
     rest = np.flatnonzero(~fits)
     if rest.size:
         left_over = jax.tree.map(lambda a: a[rest], host)
-        again = oriented(
-            left_over, options | {"start": start.general}, Way(threads, chunk), unheard
-        )
-        out = _replaced(out, rest, again)
+        general = problem.starting(start.general)
+        out = _replace_rows(out, rest, orient_slabs(left_over, general, read, way))
     return _finish(out)
 
 
-def settled(options: dict[str, Any]) -> dict[str, Any]:
-    """The options of `orient`, a given base as an array: an argument, no program for
-    each value. Raises TypeError for what is none, ValueError for one of each pair."""
-    for name in set(options) - set(DEFAULTS):
-        raise TypeError(
-            f"there is no option {name!r}: orient takes {', '.join(DEFAULTS)}"
-        )
-    base, start = options.get("base"), options.get("start")
-    for name, given in (
-        ("base", base),
-        ("start", start if isinstance(start, AbstractElements) else None),
-    ):
+def problem_of_all(options: dict[str, Any]) -> Problem:
+    """The problem of these options of `orient`, the same for all pairs. Raises
+    TypeError for what is no option, ValueError for a base or start of each pair."""
+    start = options.get("start")
+    known = start if isinstance(start, AbstractElements) else None
+    for name, given in (("base", options.get("base")), ("start", known)):
         if any(jnp.ndim(leaf) for leaf in jax.tree.leaves(given)):
             raise ValueError(
                 f"`{name}` holds for all pairs of a batch; one of each pair goes with "
                 f"jax.jit(jax.vmap(lambda pair, {name}: orient(pair, "
                 f"{name}={name})))(pairs, {name})"
             )
-    return options if base is None else options | {"base": jnp.asarray(base, float)}
+    return problem_of(options)
 
 
-def oriented(
+def orient_slabs(
     pairs: Pair,
-    options: dict[str, Any],
+    problem: Problem,
+    read: Callable[[Pair, Orientation], PyTree],
     way: Way = Way(),  # noqa: B008 (frozen)
     report: Report = unheard,
 ) -> PyTree:
-    """read(pair, orientation) of every pair, in NumPy; `options`: read, start, and
-    those of `orient`."""
+    """read(pair, orientation) of every pair, in NumPy."""
     chunk = _chunk(pairs, way.chunk)
-    return spread(
-        pairs,
-        Program(_slab, options | {"chunk": chunk}, _settings(pairs)),
-        way,
-        chunk,
-        report,
-    )
-
-
-def oriented_near(
-    pairs: Pair,
-    options: dict[str, Any],
-    way: Way = Way(),  # noqa: B008 (frozen)
-    report: Report = unheard,
-) -> tuple[PyTree, np.ndarray]:
-    """The same from the vertical, and for which pairs that fits; `options["start"]` is
-    an `Auto`."""
-    chunk = _chunk(pairs, way.chunk)
-    alone = pairs.x_left.size <= ALONE
-    way = (
-        way._replace(threads=way.threads or 1, calls=0)
-        if alone
-        else way._replace(calls=1)
-    )  # all take as long
-    kernel, lasting = (
-        (whole, FAST | WIDE) if alone else (whole_of_many, FAST | WIDE | UNDIVIDED)
-    )
-    kernel = kernel if options.get("solver") is None else None
-    program = Program(
-        _slab_near, options | {"chunk": chunk}, _settings(pairs, lasting), kernel=kernel
-    )
+    options = {"problem": problem, "read": read, "chunk": chunk}
+    program = Program(_slab, options, _settings(pairs))
     return spread(pairs, program, way, chunk, report)
 
 
-def _replaced(out: PyTree, rows: np.ndarray, new: PyTree) -> PyTree:
+def orient_slabs_near(
+    pairs: Pair,
+    problem: Problem,
+    read: Callable[[Pair, Orientation], PyTree],
+    way: Way = Way(),  # noqa: B008 (frozen)
+    report: Report = unheard,
+) -> tuple[PyTree, np.ndarray]:
+    """The same from the vertical, and for which pairs that fits; `problem.start` is an
+    `Auto`."""
+    chunk = _chunk(pairs, way.chunk)
+    options = {"problem": problem, "read": read, "chunk": chunk}
+    if pairs.x_left.size <= ALONE:
+        way = way._replace(threads=way.threads or 1, calls=0)
+        kernel, lasting = whole, FAST | WIDE
+    else:
+        way = way._replace(calls=1)  # all take as long
+        kernel, lasting = whole_of_many, FAST | WIDE | UNDIVIDED
+    kernel = kernel if problem.solver is None else None
+    program = Program(_slab_near, options, _settings(pairs, lasting), kernel=kernel)
+    return spread(pairs, program, way, chunk, report)
+
+
+def _replace_rows(out: PyTree, rows: np.ndarray, new: PyTree) -> PyTree:
     """The arrays with these rows new; in place but for those that are the program's
     own."""
 
@@ -209,12 +192,9 @@ def clean_batch(
     `select=lambda r: r.mask` computes no log and no statistics that the decision does
     not need.
     """
-    host, report, way = (
-        jax.tree.map(np.asarray, double(pairs)),
-        progress or unheard,
-        Way(threads, chunk),
-    )
-    out = decided_in_stages(host, procedure, select, way, report)
+    host, report = jax.tree.map(np.asarray, double(pairs)), progress or unheard
+    way = Way(threads, chunk)
+    out = clean_in_stages(host, procedure, select, way, report)
     return _finish(out)
 
 
@@ -228,7 +208,7 @@ def stages(procedure: AbstractProcedure, points: int) -> Sequence[AbstractProced
     )
 
 
-def decided_in_stages(
+def clean_in_stages(
     pairs: Pair,
     procedure: AbstractProcedure,
     select: Callable[[Rejection], PyTree],
@@ -238,18 +218,18 @@ def decided_in_stages(
     """What is selected of every pair's rejection, in NumPy: the stages in turn, each
     for the pairs left in doubt."""
     first, *others = stages(procedure, pairs.x_left.shape[-1])
-    out, again = decided(pairs, first, select, way, report)
+    out, again = clean_slabs(pairs, first, select, way, report)
     for stage in others:
         rest = np.flatnonzero(again)
         if rest.size:
             left_over = jax.tree.map(lambda a, rest=rest: a[rest], pairs)
-            out, again = _replaced(
-                (out, again), rest, decided(left_over, stage, select, way, unheard)
+            out, again = _replace_rows(
+                (out, again), rest, clean_slabs(left_over, stage, select, way, unheard)
             )
     return out
 
 
-def decided(
+def clean_slabs(
     pairs: Pair,
     procedure: AbstractProcedure,
     select: Callable[[Rejection], PyTree],
@@ -333,8 +313,8 @@ def _settings(pairs: Pair, lasting: dict[str, Any] | None = None) -> dict[str, A
     return FAST if pairs.x_left.shape[1] > FEW else FAST | WIDE
 
 
-def _slab(pairs: Pair, *, read: Callable, chunk: int, **options) -> PyTree:
-    return chunked(lambda pair: read(pair, orient(pair, **options)), pairs, chunk)
+def _slab(pairs: Pair, *, problem: Problem, read: Callable, chunk: int) -> PyTree:
+    return chunked(lambda pair: read(pair, orient_once(pair, problem)), pairs, chunk)
 
 
 def _slab_mapped(pairs: Pair, *, function: Callable, chunk: int) -> PyTree:
@@ -342,10 +322,10 @@ def _slab_mapped(pairs: Pair, *, function: Callable, chunk: int) -> PyTree:
 
 
 def _slab_near(
-    pairs: Pair, *, read: Callable, chunk: int, start: Auto, **options
+    pairs: Pair, *, problem: Problem, read: Callable, chunk: int
 ) -> tuple[PyTree, Array]:
     def one(pair: Pair):
-        orientation, fits = orient_near(pair, start=start, **options)
+        orientation, fits = orient_near(pair, problem)
         return read(pair, orientation), fits
 
     return chunked(one, pairs, chunk)

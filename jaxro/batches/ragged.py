@@ -14,16 +14,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
 from ..geometry.pairs import Pair, double, pair
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..rejection import AbstractProcedure, Rejection
 from .batch import (
     Report,
     Way,
-    decided,
-    oriented,
-    oriented_near,
-    settled,
+    clean_slabs,
+    orient_slabs,
+    orient_slabs_near,
+    problem_of_all,
     stages,
     unheard,
 )
@@ -201,7 +201,7 @@ def orient_ragged(
     """
     pairs = checked(pairs)
     plan = _fitting(plan, pairs)
-    options = settled(options | {"start": start}) | {"read": read}
+    problem = problem_of_all(options | {"start": start})
     out = _Out(pairs, progress)
     rest = [np.zeros(0, int)]
     batches = _batches(pairs, plan.sizes, plan.slabs, threads)
@@ -213,7 +213,9 @@ def orient_ragged(
     def near(
         members: np.ndarray, size: int, way: Way
     ) -> tuple[np.ndarray, int, PyTree, np.ndarray]:
-        found, fits = oriented_near(pairs.padded(members, size), options, way, told)
+        found, fits = orient_slabs_near(
+            pairs.padded(members, size), problem, read, way, told
+        )
         return members, size, found, members[~fits]
 
     def given(
@@ -222,7 +224,7 @@ def orient_ragged(
         return (
             members,
             size,
-            oriented(pairs.padded(members, size), options, way, told),
+            orient_slabs(pairs.padded(members, size), problem, read, way, told),
             members[:0],
         )
 
@@ -234,11 +236,12 @@ def orient_ragged(
         if not in_turn:
             out.told(len(members), len(members))
         rest.append(left)
-    general = options | {"start": getattr(start, "general", start)}
+    general = problem.starting(start.general) if isinstance(start, Auto) else problem
     for members, size, way in _batches(
         pairs, plan.fewer, None, threads, np.concatenate(rest)
     ):
-        out.store(members, size, oriented(pairs.padded(members, size), general, way))
+        again = orient_slabs(pairs.padded(members, size), general, read, way)
+        out.store(members, size, again)
     return eqx.combine(*out.tree) if read is split else out.tree
 
 
@@ -288,7 +291,7 @@ def clean_ragged(
     ]  # by the number of procedures that are left for a pair
     for members, size, way in _batches(pairs, plan.sizes, None, threads):
         first, *others = stages(procedure, size)
-        found, doubt = decided(
+        found, doubt = clean_slabs(
             pairs.padded(members, size), first, select, way, out.told
         )
         out.store(members, size, found)
@@ -297,7 +300,7 @@ def clean_ragged(
         for members, size, way in _batches(
             pairs, plan.fewer, None, threads, np.concatenate(doubtful[left])
         ):
-            found, doubt = decided(
+            found, doubt = clean_slabs(
                 pairs.padded(members, size), every[-left], select, way, unheard
             )
             out.store(members, size, found)

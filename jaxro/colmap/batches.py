@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..batches.batch import decided_in_stages
+from ..batches.batch import clean_in_stages
 from ..batches.buckets import buckets
 from ..batches.padding import FEWER
 from ..geometry.pairs import Pair
@@ -79,7 +79,7 @@ def _found(
     told: Callable[[int], None],
 ) -> Found:
     pairs = batch(block, points, size, sigma)
-    verdicts = decided_in_stages(
+    verdicts = clean_in_stages(
         pairs, ENGINE, verdict, ONE_BY_ONE, lambda done, total: told(done)
     )
     return spread((pairs, verdicts), Program(_all_classified, {}), ONE_BY_ONE, 1)

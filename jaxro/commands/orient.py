@@ -20,7 +20,8 @@ from ..geometry.elements import (
     RelativePose,
 )
 from ..geometry.pairs import Camera, Pair
-from ..orientation.orient import Orientation, orient
+from ..orientation.orient import orient
+from ..orientation.result import Orientation
 from ..reports import files, pair as report, reliability as reading, solutions
 from ..reports.solutions import Solution, Solved, Units
 from ..reports.terminal import consoles, progress

@@ -2,8 +2,7 @@
 
     g = b . (p1 x R p2) = 0,    p = (x, y, -f)
 
-Two ways to adjust it, each a function of the pair that says what is adjusted:
-condition, observations, cofactors.
+Two ways to adjust it, each a function of the pair that returns a `Term`:
 
 * `rigorous`: all four coordinates are measured with errors; the whitened residual is g
   / sqrt(B Q Bᵀ), B = dg/dl. Statistically right, the default.
@@ -14,12 +13,13 @@ Both residuals are in the unit of the coordinates when sigma is 1.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
+from ..adjustment.residuals import Residuals
+from ..adjustment.terms import Term
 from . import rotations as rot
 from .elements import AbstractElements, essential
 from .pairs import Pair
@@ -28,16 +28,6 @@ from .rotations import Matrix, Vector
 Scalar = Float[Array, "..."]
 Point = tuple[Scalar, Scalar, Scalar, Scalar]
 """x_left, y_left, x_right, y_right of one point"""
-
-
-class Adjusted(NamedTuple):
-    """What `adjust` needs: prepare(R, b) once for the pair, condition(prepared,
-    observation) of one point, and the observations and cofactors of all points."""
-
-    prepare: Callable
-    condition: Callable
-    observations: tuple
-    cofactor: PyTree
 
 
 def fundamental_matrix(
@@ -112,15 +102,22 @@ def parallaxes(pair: Pair, pose: AbstractElements) -> Float[Array, " point"]:
     return jax.vmap(parallax_of(pair, pose))(pair.coordinates)
 
 
-def rigorous(pair: Pair) -> Adjusted:
+def rigorous(pair: Pair) -> Term:
     """Adjust the four image coordinates of every point."""
     prepare = lambda rotation, base: fundamental_matrix(
         rotation, base, pair.focal_left, pair.focal_right
     )
-    return Adjusted(prepare, condition, pair.coordinates, pair.sigma**2)
+    return Term(
+        condition, pair.coordinates, pair.sigma**2, mask=pair.mask, prepare=prepare
+    )
 
 
-def parallax(pair: Pair) -> Adjusted:
+def residuals(pair: Pair, pose: AbstractElements) -> Residuals:
+    """The rigorous residuals of a pair as a function of a displacement of a pose."""
+    return Residuals(rigorous(pair), pose)
+
+
+def parallax(pair: Pair) -> Term:
     """Adjust the y-parallax of every point as if it had been measured; the coordinates
     are taken as free of error."""
 
@@ -133,12 +130,9 @@ def parallax(pair: Pair) -> Adjusted:
         point, measured = observation
         return y_parallax((left, right), point, *focals) - measured
 
-    return Adjusted(
-        prepare,
-        of_point,
-        (pair.coordinates, jnp.zeros_like(pair.sigma)),
-        (None, pair.sigma**2),
-    )
+    observations = pair.coordinates, jnp.zeros_like(pair.sigma)
+    cofactor = None, pair.sigma**2
+    return Term(of_point, observations, cofactor, mask=pair.mask, prepare=prepare)
 
 
 def linearised(

@@ -62,7 +62,7 @@ class AbstractElements(AbstractParameters):
         return self.relative()
 
     @abc.abstractmethod
-    def moved(self, step: Step) -> "AbstractElements":
+    def moved(self, step: Step | Float[Array, " count"]) -> "AbstractElements":
         """The elements after a small displacement of their five (local) parameters."""
 
     @abc.abstractmethod
@@ -136,7 +136,7 @@ class RelativePose(AbstractElements):
     def model_frame(self) -> Matrix:
         return rot.identity(self.qw)
 
-    def moved(self, step: Step) -> "RelativePose":
+    def moved(self, step: Step | Float[Array, " count"]) -> "RelativePose":
         a, b, c, u, v = step
         a, b, c = a / 2, b / 2, c / 2
         w, x, y, z = self.qw, self.qx, self.qy, self.qz
@@ -247,7 +247,7 @@ class IndependentElements(AbstractElements):
     def model_frame(self) -> Matrix:
         return rot.product(rot.r_alpha(self.phi1), rot.r_chi(self.kappa1))
 
-    def moved(self, step: Step) -> "IndependentElements":
+    def moved(self, step: Step | Float[Array, " count"]) -> "IndependentElements":
         return IndependentElements(
             *(value + s for value, s in zip(self.values(), step, strict=True))
         )
@@ -306,7 +306,7 @@ class DependentElements(AbstractElements):
     def model_frame(self) -> Matrix:
         return rot.identity(self.bx)
 
-    def moved(self, step: Step) -> "DependentElements":
+    def moved(self, step: Step | Float[Array, " count"]) -> "DependentElements":
         return DependentElements(
             *(value + s for value, s in zip(self.values(), step, strict=True)), self.bx
         )

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..adjustment.residuals import Residuals
 from . import coplanarity
 from .elements import RelativePose
 from .pairs import Coordinates, Pair
@@ -40,13 +39,13 @@ class Linear(NamedTuple):
 def linearised(pair: Pair, pose: RelativePose) -> Linear:
     """The rigorous conditions of one pair at a pose, with its sigma; the pair is
     `cleaned`."""
-    prepare, condition, observations, cofactor = coplanarity.rigorous(pair)
-    residuals = Residuals(prepare, condition, pose, observations, cofactor, pair.mask)
+    residuals = coplanarity.residuals(pair, pose)
     (g,), jacobian, weight = residuals.columns((jnp.zeros_like(pair.focal_left),) * 5)
-    f = prepare(*pose.relative())
-    gradient = jax.vmap(lambda point: jax.grad(condition, argnums=1)(f, point))(
-        pair.coordinates
+    f = coplanarity.fundamental_matrix(
+        *pose.relative(), pair.focal_left, pair.focal_right
     )
+    of_point = jax.grad(coplanarity.condition, argnums=1)
+    gradient = jax.vmap(lambda point: of_point(f, point))(pair.coordinates)
     used = lambda a: jnp.where(pair.mask, a, 0.0)
     columns = [used(column) for (column,) in jacobian]
     return Linear(used(g), columns, tuple(used(b) for b in gradient), weight[0])  # pyright: ignore[reportOptionalSubscript]

@@ -122,6 +122,13 @@ class Pair(eqx.Module):
             )
         return eqx.tree_at(lambda pair: pair.mask, self, new)
 
+    def with_sigma(self, sigma: ArrayLike) -> "Pair":
+        """The same pair with other standard deviations, of all points or of each."""
+        new = jnp.broadcast_to(
+            jnp.asarray(sigma, self.sigma.dtype), jnp.shape(self.sigma)
+        )
+        return eqx.tree_at(lambda pair: pair.sigma, self, new)
+
 
 def pair(
     x_left: Values,

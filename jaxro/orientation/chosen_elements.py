@@ -20,7 +20,7 @@ from ..xla.reductions import total
 from .inspection import Inspection
 
 
-def facing(
+def face_points(
     pose: RelativePose, inspected: Inspection, free: bool
 ) -> tuple[RelativePose, Bool[Array, ""]]:
     """The pose with the sign of its base that puts most points in front: g does not
@@ -61,7 +61,7 @@ def length(
     return jnp.where((pose.bx < 0) & (system is DependentElements), -mean, mean)
 
 
-def chosen(
+def in_system(
     solved: AbstractElements, cofactor, flipped, system: type[AbstractElements], length
 ):
     """The elements in the chosen system and their cofactors J Q Jᵀ."""

@@ -23,7 +23,6 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..adjustment.normal_equations import accumulate, solve, steps
-from ..adjustment.residuals import Residuals
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, cleaned
@@ -262,7 +261,7 @@ def refined(
 ) -> RelativePose:
     """The pose after some Gauss-Newton steps on the points in use, or unchanged where
     they fail."""
-    residuals = _residuals(pair.with_mask(pair.mask & use), pose)
+    residuals = coplanarity.residuals(pair.with_mask(pair.mask & use), pose)
     moved = pose.moved(
         steps(residuals, (jnp.zeros_like(pair.focal_left),) * 5, count, 0.3)
     ).normalised()
@@ -272,7 +271,7 @@ def refined(
 
 def squares(pair: Pair, pose: RelativePose) -> Float[Array, ""]:
     """Σ r² of the points at a pose."""
-    r = _residuals(pair, pose)((jnp.zeros_like(pair.focal_left),) * 5)
+    r = coplanarity.residuals(pair, pose)((jnp.zeros_like(pair.focal_left),) * 5)
     return jnp.sum(jnp.where(pair.mask, r * r, 0.0))
 
 
@@ -304,8 +303,3 @@ def behind(pair: Pair, pose: RelativePose) -> Float[Array, ""]:
     return count(pair.mask & jax.vmap(one)(pair.coordinates)) / jnp.maximum(
         count(pair.mask), 1.0
     )
-
-
-def _residuals(pair: Pair, pose: RelativePose) -> Residuals:
-    prepare, condition, observations, cofactor = coplanarity.rigorous(pair)
-    return Residuals(prepare, condition, pose, observations, cofactor, pair.mask)

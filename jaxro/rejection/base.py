@@ -20,7 +20,8 @@ from ..geometry.elements import (
     convert,
 )
 from ..geometry.pairs import Pair
-from ..orientation.orient import Orientation, orient
+from ..orientation.orient import orient
+from ..orientation.result import Orientation
 from ..orientation.results import is_usable
 from ..xla.programs import while_loop
 from ..xla.reductions import count, total
@@ -266,15 +267,8 @@ def by_parallax(
 ) -> Orientation:
     """The strict orientation of the papers: q of unit weight, independent elements,
     from zero if no start is given."""
-    unit = Pair(
-        *pair.coordinates,
-        jnp.ones_like(pair.sigma),
-        pair.mask,
-        pair.focal_left,
-        pair.focal_right,
-    )
     return orient(
-        unit.with_mask(mask),
+        pair.with_sigma(1.0).with_mask(mask),
         elements=IndependentElements,
         residual=coplanarity.parallax,
         start=zero_elements(pair) if start is None else start,
@@ -304,15 +298,8 @@ def residuals_at(
 ) -> Residuals:
     """The parallaxes of the points in use as a function of a displacement of the
     elements."""
-    unit = Pair(
-        *pair.coordinates,
-        jnp.ones_like(pair.sigma),
-        pair.mask,
-        pair.focal_left,
-        pair.focal_right,
-    )
-    prepare, condition, observations, cofactor = coplanarity.parallax(unit)
-    return Residuals(prepare, condition, elements, observations, cofactor, mask)
+    unit = pair.with_sigma(1.0).with_mask(mask)
+    return Residuals(coplanarity.parallax(unit), elements)
 
 
 def values(elements: AbstractElements) -> Float[Array, "*pairs 5"]:

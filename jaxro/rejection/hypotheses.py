@@ -12,7 +12,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment.normal_equations import solve
-from ..adjustment.residuals import Residuals
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
@@ -224,8 +223,7 @@ def solutions(
 
 def squares(pair: Pair, pose: RelativePose) -> Float[Array, "point"]:
     """(r / sigma)² of every point."""
-    prepare, condition, observations, cofactor = coplanarity.rigorous(pair)
-    residuals = Residuals(prepare, condition, pose, observations, cofactor, pair.mask)
+    residuals = coplanarity.residuals(pair, pose)
     one = lambda g, d, use: jnp.where(use, g[0] ** 2 / d[0][0], 0.0)
     return residuals.groups(
         one, residuals.shared(*(jnp.zeros_like(pair.focal_left),) * 5)

@@ -22,7 +22,7 @@ from ..geometry.elements import (
     RelativePose,
 )
 from ..geometry.pairs import Pair
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 from ..orientation.results import RESULTS
 from ..xla.reductions import count
 from .files import POINTS, RESIDUALS, head

@@ -23,7 +23,7 @@ from ..geometry import rotations as rot
 from ..geometry.elements import AbstractElements, DependentElements, RelativePose
 from ..geometry.linear import Linear, linearised
 from ..geometry.pairs import Camera, Coordinates, Pair, cleaned
-from ..orientation.orient import Orientation
+from ..orientation.result import Orientation
 from ..orientation.results import RESULTS
 from ..tables.csv import Measurements
 from ..xla.programs import FAST, QUICK, Program

@@ -228,7 +228,7 @@ def _solved(
         for node in (network.first, network.last)
     ]
     measured = end(network.first), end(network.last), rise
-    term = Term(condition, measured, (None, None, q), ends)
+    term = Term(condition, measured, (None, None, q), touches=ends)
     return adjust(term, {"height": jnp.broadcast_to(fixed[0], (count,))})
 
 

@@ -8,7 +8,7 @@ import optimistix as optx
 import pytest
 
 import jaxro
-from jaxro.adjustment import normal_equations
+from jaxro.adjustment import Term, normal_equations
 
 # Levelling net of four unknown heights over one datum point (0): seven observed
 # differences [m], lengths [km].
@@ -27,13 +27,8 @@ def levelling(heights, observation):
 
 def net(rise, solver=None):
     observations = (jnp.asarray(FROM), jnp.asarray(TO), rise)
-    return jaxro.adjust(
-        levelling,
-        jnp.zeros(4),
-        observations,
-        (None, None, jnp.asarray(LENGTH)),
-        solver=solver,
-    )
+    term = Term(levelling, observations, (None, None, jnp.asarray(LENGTH)))
+    return jaxro.adjust(term, jnp.zeros(4), solver=solver)
 
 
 def test_levelling_net_equals_normal_equations():
@@ -94,14 +89,8 @@ def test_line_with_errors_in_both_coordinates(solver):
     """York's exact solution: a = 5.47991022, b = -0.480533407, S = 11.8663532."""
     start = (jnp.asarray(5.0), jnp.asarray(-0.5))
     cofactor = (jnp.asarray(1 / WX), jnp.asarray(1 / WY))
-    result = jaxro.adjust(
-        line,
-        start,
-        (jnp.asarray(X), jnp.asarray(Y)),
-        cofactor,
-        solver=solver,
-        max_steps=100,
-    )
+    term = Term(line, (jnp.asarray(X), jnp.asarray(Y)), cofactor)
+    result = jaxro.adjust(term, start, solver=solver, max_steps=100)
     assert result.result == jaxro.adjustment.RESULTS.successful
     np.testing.assert_allclose(result.parameters, (5.47991022, -0.480533407), rtol=2e-9)
     np.testing.assert_allclose(result.sigma0**2 * 8, 11.8663532, rtol=1e-8)
@@ -112,12 +101,12 @@ def test_a_variance_may_stand_for_many_entries():
     out, for numbers and arrays."""
     start = (jnp.asarray(5.0), jnp.asarray(-0.5))
     x, y, variance = jnp.asarray(X), jnp.asarray(Y), jnp.asarray(1 / WX)
-    written = jaxro.adjust(line, start, (x, y), (variance, variance))
-    shared = jaxro.adjust(line, start, (x, y), variance)
-    together = jaxro.adjust(line, start, jnp.stack([x, y], axis=1), variance)
-    entries = jaxro.adjust(
-        line, start, jnp.stack([x, y], axis=1), jnp.stack([variance, variance], axis=1)
-    )
+    both = jnp.stack([x, y], axis=1)
+    variances = jnp.stack([variance, variance], axis=1)
+    written = jaxro.adjust(Term(line, (x, y), (variance, variance)), start)
+    shared = jaxro.adjust(Term(line, (x, y), variance), start)
+    together = jaxro.adjust(Term(line, both, variance), start)
+    entries = jaxro.adjust(Term(line, both, variances), start)
     for other in (shared, together, entries):
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12),
@@ -144,7 +133,7 @@ def test_vector_conditions_are_whitened_together():
     points = lambda a: tuple(jnp.asarray(column) for column in a.T)
     cofactor = (tuple(var_p.tolist()), tuple(var_q.tolist()))
     start = (jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(0.0))
-    result = jaxro.adjust(motion, start, (points(p), points(q)), cofactor)
+    result = jaxro.adjust(Term(motion, (points(p), points(q)), cofactor), start)
 
     def objective(x):
         c, s = np.cos(x[0]), np.sin(x[0])
@@ -175,12 +164,9 @@ def test_more_parameters_than_are_unrolled():
     a = np.zeros((start.size, 21))
     a[np.arange(start.size), end] += 1
     a[np.arange(start.size), start] -= 1
-    result = jaxro.adjust(
-        levelling,
-        jnp.zeros(20),
-        (jnp.asarray(start), jnp.asarray(end), jnp.asarray(rise)),
-        (None, None, 1.0),
-    )
+    observations = jnp.asarray(start), jnp.asarray(end), jnp.asarray(rise)
+    term = Term(levelling, observations, (None, None, 1.0))
+    result = jaxro.adjust(term, jnp.zeros(20))
     np.testing.assert_allclose(
         result.parameters, np.linalg.lstsq(a[:, 1:], rise, rcond=None)[0], atol=1e-12
     )
@@ -196,12 +182,8 @@ def test_more_parameters_than_are_unrolled():
 
 
 def test_undetermined_parameter_is_reported():
-    result = jaxro.adjust(
-        levelling,
-        jnp.zeros(3),
-        (jnp.asarray([0, 1, 0]), jnp.asarray([1, 2, 2]), jnp.asarray([1.0, 1.0, 2.1])),
-        (None, None, 1.0),
-    )
+    legs = jnp.asarray([0, 1, 0]), jnp.asarray([1, 2, 2]), jnp.asarray([1.0, 1.0, 2.1])
+    result = jaxro.adjust(Term(levelling, legs, (None, None, 1.0)), jnp.zeros(3))
     assert result.result == jaxro.adjustment.RESULTS.rank_deficient
 
 

@@ -42,8 +42,8 @@ def legs(net, mask=None):
         lambda a, b, rise: b - a - rise,
         rise,
         variance,
-        [("height", start), ("height", end)],
-        mask,
+        touches=[("height", start), ("height", end)],
+        mask=mask,
     )
 
 
@@ -51,7 +51,7 @@ KNOWN = Term(
     lambda height, known: height - known,
     np.array([1.5]),
     0.01,
-    [("height", np.array([0]))],
+    touches=[("height", np.array([0]))],
 )
 solve = eqx.filter_jit(lambda term: adjust([term, KNOWN], {"height": jnp.zeros(NODES)}))
 
@@ -209,12 +209,14 @@ def terms_of(bundle):
     camera, point, rays, ground, _ = bundle
     image = lambda camera, point, measured: photo(jnp, camera, point) - measured
     return [
-        Term(image, rays, IMAGE_SIGMA**2, [("camera", camera), ("point", point)]),
+        Term(
+            image, rays, IMAGE_SIGMA**2, touches=[("camera", camera), ("point", point)]
+        ),
         Term(
             lambda point, known: point - known,
             ground,
             GROUND_SIGMA**2,
-            [("point", np.arange(CONTROL))],
+            touches=[("point", np.arange(CONTROL))],
         ),
     ]
 
@@ -333,7 +335,7 @@ def test_a_pair_as_one_of_several_terms_is_the_pair():
             jnp.stack(base), jnp.cross(left, right @ jnp.stack([x2, y2, -100.0]))
         )
 
-    term = Term(condition, flat, 1e-4, [("pose", np.repeat(np.arange(2), 12))])
+    term = Term(condition, flat, 1e-4, touches=[("pose", np.repeat(np.arange(2), 12))])
     start, off = (
         jax.tree.map(lambda a: a[:2], alone.pose),
         jnp.array([0.02, -0.01, 0.01, 0.02, -0.02]),
@@ -395,7 +397,7 @@ def test_a_member_that_is_not_there_is_told():
         lambda height, known: height - known,
         np.array([1.5]),
         0.01,
-        [("height", np.array([3]))],
+        touches=[("height", np.array([3]))],
     )
     with pytest.raises(ValueError, match="not there"):
         adjust(beyond, {"height": jnp.zeros(3)})

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxro
+from jaxro.adjustment import Term
 from jaxro.surveys import accuracy as accuracy, levelling
 
 
@@ -114,9 +115,9 @@ def test_adjust_itself_gives_the_same_for_all_legs():
         return every[b] - every[a] - rise
 
     observations = jnp.asarray(start), jnp.asarray(end), jnp.asarray(rises)
-    full = jax.jit(
-        lambda o: jaxro.adjust(condition, jnp.zeros(2), o, (None, None, jnp.asarray(q)))
-    )(observations)
+    cofactor = None, None, jnp.asarray(q)
+    solve = lambda o: jaxro.adjust(Term(condition, o, cofactor), jnp.zeros(2))
+    full = jax.jit(solve)(observations)
     found = small(rises, q, known)
     np.testing.assert_allclose(found.heights[2:], full.parameters, atol=1e-12)
     np.testing.assert_allclose(

@@ -11,7 +11,7 @@ Known elements are a start, too: pass them instead.
 """
 
 from .auto import Auto as Auto
-from .base import AbstractStart as AbstractStart, Begin as Begin
+from .base import AbstractStart as AbstractStart, StartingPose as StartingPose
 from .general import General as General
 from .six_points import SixPoints as SixPoints
 from .vertical import Vertical as Vertical

@@ -9,7 +9,7 @@ from ...geometry.elements import RelativePose
 from ...geometry.pairs import Pair
 from ...xla.programs import while_loop
 from ..inspection import Inspection, inspect
-from .base import AbstractStart, Begin, approached
+from .base import AbstractStart, StartingPose, approached
 from .general import General
 
 
@@ -44,7 +44,7 @@ class Auto(AbstractStart):
             inspected.distance < self.tolerance * jnp.minimum(1.0, 2 * inspected.spread)
         )
 
-    def __call__(self, pair: Pair) -> Begin:
+    def __call__(self, pair: Pair) -> StartingPose:
         near = approached(pair, self.steps)
         fits = self.fits(near, inspect(pair, near))
 
@@ -56,7 +56,7 @@ class Auto(AbstractStart):
         def needed(state):
             return state[0]
 
-        def general(state) -> tuple[Array, Begin]:
+        def general(state) -> tuple[Array, StartingPose]:
             pick = lambda new, old: jnp.where(state[0], new, old)
             with jax.named_scope("general"):
                 found = self.general(pair.with_mask(pair.mask & state[0]))
@@ -64,5 +64,5 @@ class Auto(AbstractStart):
 
         no = jnp.zeros_like(fits)
         return while_loop(
-            needed, general, (~fits, Begin(near, no, no)), pair.focal_left
+            needed, general, (~fits, StartingPose(near, no, no)), pair.focal_left
         )[1]

@@ -18,7 +18,7 @@ LONGEST = 0.5
 """Longest component of a step towards a start (rad)."""
 
 
-class Begin(NamedTuple):
+class StartingPose(NamedTuple):
     """A pose to begin with, whether another one fits the points as well, and whether a
     rotation alone explains them."""
 
@@ -32,16 +32,14 @@ class AbstractStart(eqx.Module):
     masked points hold."""
 
     @abc.abstractmethod
-    def __call__(self, pair: Pair) -> Begin:
+    def __call__(self, pair: Pair) -> StartingPose:
         """The pose to begin with."""
 
 
 def distances(pair: Pair, pose: RelativePose) -> Residuals:
     """Distances of the points from the condition, in the unit of the coordinates,
     around the pose."""
-    prepare, condition, observations, _ = coplanarity.rigorous(pair)
-    unit = jnp.ones_like(pair.sigma)
-    return Residuals(prepare, condition, pose, observations, unit, pair.mask)
+    return coplanarity.residuals(pair.with_sigma(1.0), pose)
 
 
 class FirstOrder(NamedTuple):

@@ -21,7 +21,7 @@ from ...xla.selection import where_needed
 from .. import degeneracy, planes
 from ..degeneracy import significant
 from ..inspection import inspect
-from .base import AbstractStart, Begin, distances
+from .base import AbstractStart, StartingPose, distances
 from .decomposition import best_pose, cheirality
 from .eight_point import eight_point
 from .five_point import five_point
@@ -62,16 +62,16 @@ class General(AbstractStart):
     refined: int = 4
     steps: int = 6
 
-    def __call__(self, pair: Pair) -> Begin:
+    def __call__(self, pair: Pair) -> StartingPose:
         no = jnp.zeros_like(pair.focal_left, bool)
-        nothing = Begin(vertical(pair.focal_left), no, no)
+        nothing = StartingPose(vertical(pair.focal_left), no, no)
         points = AT_ONCE if jax.default_backend() == "cpu" else ON_DEVICES
         most = max(points // max(pair.x_left.shape[0], 1), 1)
         return where_needed(
             self._begin, jnp.any(pair.mask), lax.stop_gradient(pair), nothing, most
         )
 
-    def _begin(self, pair: Pair) -> Begin:
+    def _begin(self, pair: Pair) -> StartingPose:
         pair = pad(
             pair, max(pair.x_left.shape[0], 1)
         )  # of no points there are no candidates to choose from
@@ -106,7 +106,7 @@ class General(AbstractStart):
         )
         pure = parallax < significant(freedom) * noise + 1e-9
         pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
-        return Begin(pose, ambiguous & ~pure, pure)
+        return StartingPose(pose, ambiguous & ~pure, pure)
 
     def _candidates(
         self, pair: Pair, judges: Pair

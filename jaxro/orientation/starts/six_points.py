@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from ...geometry.elements import IndependentElements, to_pose
 from ...geometry.pairs import Pair
 from ...xla.reductions import total
-from .base import AbstractStart, Begin
+from .base import AbstractStart, StartingPose
 
 Scalar = Float[Array, ""] | float
 
@@ -60,7 +60,7 @@ class SixPoints(AbstractStart):
     from their zones.
     """
 
-    def __call__(self, pair: Pair) -> Begin:
+    def __call__(self, pair: Pair) -> StartingPose:
         focal = pair.focal_left
         parallax = pair.y_left - pair.y_right * (focal / pair.focal_right)
         base = total(
@@ -77,7 +77,7 @@ class SixPoints(AbstractStart):
         y = sum(jnp.abs(pair.y_left[i]) for i in nearest[2:]) / 4
         elements = six_points(jnp.stack([parallax[i] for i in nearest]), y, base, focal)
         no = jnp.zeros_like(focal, bool)
-        return Begin(to_pose(elements), no, no)
+        return StartingPose(to_pose(elements), no, no)
 
 
 def first_order_design(

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from ...geometry.pairs import Pair
-from .base import AbstractStart, Begin, approached
+from .base import AbstractStart, StartingPose, approached
 
 
 class Vertical(AbstractStart):
@@ -16,6 +16,6 @@ class Vertical(AbstractStart):
 
     steps: int = 2
 
-    def __call__(self, pair: Pair) -> Begin:
+    def __call__(self, pair: Pair) -> StartingPose:
         no = jnp.zeros_like(pair.focal_left, bool)
-        return Begin(approached(pair, self.steps), no, no)
+        return StartingPose(approached(pair, self.steps), no, no)

@@ -1,0 +1,152 @@
+"""The result of an orientation."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from ..adjustment import critical_values
+from ..adjustment.guarded import root, times
+from ..geometry import coplanarity
+from ..geometry.elements import AbstractElements, RelativePose
+from ..geometry.pairs import Coordinates, Pair, cleaned
+from ..xla.programs import FAST, QUICK, Program, traced
+from .results import RESULTS, is_usable
+
+
+class Orientation(eqx.Module):
+    """The relative orientation of a pair; for a batch every field has leading axes.
+
+    Of every point (zero or False where masked): `parallax` the strict y-parallax q = y1* -
+    y2* of the photos turned parallel to the base; `residuals` the whitened residuals
+    that were minimised; `redundancy` numbers, which add up to the degrees of freedom;
+    `model` (X, Y, Z) in the frame and scale of the elements; `in_front` of both photos.
+
+    `m_q` = sqrt([qq]/(n-5)), `sigma0` = sqrt(Σ r²/(n-5)): the standard deviation of a
+    coordinate in its own unit when no sigma was given, else its ratio to the given
+    sigma. Both NaN without redundancy. `cofactor`: of the five elements in the order of
+    `elements.names`; rad, and the unit of the base.
+    """
+
+    pose: RelativePose
+    elements: AbstractElements
+    cofactor: Float[Array, "*pairs 5 5"]
+    parallax: Float[Array, "*pairs point"]
+    residuals: Float[Array, "*pairs point"]
+    redundancy: Float[Array, "*pairs point"]
+    model: tuple[
+        Float[Array, "*pairs point"],
+        Float[Array, "*pairs point"],
+        Float[Array, "*pairs point"],
+    ]
+    in_front: Bool[Array, "*pairs point"]
+    m_q: Float[Array, "*pairs"]
+    sigma0: Float[Array, "*pairs"]
+    degrees_of_freedom: Int[Array, "*pairs"]
+    iterations: Int[Array, "*pairs"]
+    result: RESULTS
+
+    @property
+    def covariance(self) -> Float[Array, "*pairs 5 5"]:
+        """sigma0² times the cofactors (a posteriori)."""
+        return times(self.cofactor, self.sigma0[..., None, None] ** 2)
+
+    @property
+    def deviations(self) -> Float[Array, "*pairs 5"]:
+        """Standard deviations of the elements."""
+        return times(self._roots, self.sigma0[..., None])
+
+    @property
+    def _roots(self) -> Float[Array, "*pairs 5"]:
+        """Roots of the cofactors of the elements."""
+        return root(jnp.diagonal(self.cofactor, axis1=-2, axis2=-1))
+
+    @property
+    def correlation(self) -> Float[Array | np.ndarray, "*pairs 5 5"]:
+        """Correlations of the elements."""
+        roots = self.cofactor.diagonal(axis1=-2, axis2=-1) ** 0.5
+        return self.cofactor / (roots[..., :, None] * roots[..., None, :])
+
+    @property
+    def usable(self) -> Bool[Array, "*pairs"]:
+        """Whether the elements may be used; `result` says why not, or what to mind."""
+        return is_usable(self.result)
+
+    def interval(
+        self, confidence: float = 0.95, *, sigma0: ArrayLike | None = None
+    ) -> Float[Array, "*pairs 5"]:
+        """Half widths of the intervals that hold each element with this probability.
+
+        A posteriori: Student's t of n - 5 degrees of freedom times `deviations`;
+        infinite or NaN without any. With the `sigma0` known before the measurement (1
+        where the sigmas given are standard deviations): the normal quantile times
+        sigma0 sqrt(Q), which exists for five points, too.
+        """
+        if sigma0 is None:
+            quantile = self._quantile(
+                lambda f: critical_values.half_width(confidence, f)
+            )
+            return times(self.deviations, quantile[..., None])
+        known = sigma0 * critical_values.normal(1 - confidence)
+        known = jnp.broadcast_to(known, self.sigma0.shape)
+        return times(self._roots, known[..., None])
+
+    def radius(
+        self, confidence: float = 0.95, *, sigma0: ArrayLike | None = None
+    ) -> Float[Array, "*pairs"]:
+        """Of the joint region that holds the five elements with this probability: d of
+        them from the adjusted ones, d' C⁻¹ d <= radius², C the covariance a posteriori
+        or, with a known sigma0, sigma0² Q.
+
+        sqrt(5 F) of 5 and n - 5 degrees of freedom, or the root of the chi-squared
+        quantile of 5.
+        """
+        if sigma0 is not None:
+            known = jnp.sqrt(critical_values.chi_squared(1 - confidence, 5))
+            return jnp.broadcast_to(known, self.sigma0.shape)
+        return self._quantile(lambda f: critical_values.radius(confidence, 5, f))
+
+    def _quantile(self, of: Callable[[Array], Array]) -> Float[Array, "*pairs"]:
+        """A quantile by the degrees of freedom of every pair."""
+        most = max(self.residuals.shape[-1] - 5, 0)
+        table = lambda freedom: critical_values.by_count(of, most, freedom)
+        return jnp.vectorize(table)(
+            jnp.asarray(self.degrees_of_freedom, self.sigma0.dtype)
+        )
+
+    def corrections(self, pair: Pair) -> Coordinates:
+        """The corrections v of (x_left, y_left, x_right, y_right) of the oriented pair,
+        zero where masked."""
+        data = self.pose, pair
+        if traced(data):
+            return _corrections_of(data)
+        settings = FAST if jnp.ndim(self.sigma0) else QUICK
+        return Program(_corrections_of, {}, settings)(data)
+
+    def check(self) -> "Orientation":
+        """This orientation; raises RuntimeError with advice if any of it is not
+        usable."""
+        if not bool(jnp.all(self.usable)):
+            if jnp.ndim(self.usable) == 0:
+                raise RuntimeError(RESULTS[self.result])
+            raise RuntimeError(
+                f"{int(jnp.sum(~self.usable))} of {self.usable.size} pairs are not "
+                "oriented; see result"
+            )
+        return self
+
+
+def _corrections_of(data: tuple[RelativePose, Pair]) -> Coordinates:
+    if data[0].qw.ndim:
+        return jax.vmap(_corrections_of)(data)
+    pose, pair = data
+    pair, _ = cleaned(pair)
+    f = coplanarity.fundamental_matrix(
+        *pose.relative(), pair.focal_left, pair.focal_right
+    )
+    return jax.vmap(lambda point, use: coplanarity.corrections(f, point, use))(
+        pair.coordinates, pair.mask
+    )

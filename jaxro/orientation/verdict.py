@@ -1,0 +1,117 @@
+"""How an orientation ended: a table of conditions in the order of their precedence."""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from ..adjustment import results
+from ..geometry.elements import AbstractElements
+from ..geometry.pairs import Pair
+from . import chosen_elements, degeneracy, planes
+from .degeneracy import WorstDirection
+from .describe import Description
+from .problem import Problem
+from .results import RESULTS, of_adjustment
+from .solve import Solution
+
+WEAK = 0.04
+"""Standard deviation (rad) of a local parameter above which the linearised statistics
+no longer mean anything."""
+
+
+def verdict(
+    pair: Pair,
+    problem: Problem,
+    solution: Solution,
+    description: Description,
+    bad_input: Bool[Array, ""],
+) -> RESULTS:
+    """The first result of the table whose condition holds, or else how the adjustment
+    ended. `bad_input`: whether something had to be left out of the pair."""
+    start, adjustment = solution
+    noise, pose = description.noise, description.pose
+    freedom = adjustment.degrees_of_freedom
+    solved = adjustment.result == results.RESULTS.successful
+
+    weakest = _largest_variance(adjustment.parameters, adjustment.cofactor)
+    direction = degeneracy.worst_direction(
+        pair, adjustment.parameters, adjustment.cofactor
+    )
+    second, undivided = degeneracy.folded(direction, noise)
+    twin = _twin_fits(pair, solution, description)
+    rotation = degeneracy.pure_rotation(
+        description.inspection, noise.freedom, description.sigma0
+    )
+
+    table = (
+        (RESULTS.non_finite_input, bad_input),
+        (RESULTS.too_few_points, freedom < 0),
+        (RESULTS.zero_base, rotation | start.pure_rotation),
+        (
+            RESULTS.weakly_determined,
+            solved & (_is_weak(weakest, direction, description) | undivided),
+        ),
+        (
+            RESULTS.elements_undefined,
+            solved & _elements_undefined(problem, description, weakest),
+        ),
+        (
+            RESULTS.photos_swapped,
+            solved & chosen_elements.wrong_side(problem.elements, problem.length, pose),
+        ),
+        (RESULTS.points_behind_camera, solved & (description.behind > 0)),
+        (RESULTS.two_solutions, solved & (start.ambiguous | second | twin)),
+        (RESULTS.no_redundancy, solved & (freedom == 0)),
+    )
+    result = of_adjustment(adjustment.result)
+    for name, holds in reversed(table):
+        result = RESULTS.where(holds, name, result)
+    return result
+
+
+def _largest_variance(
+    elements: AbstractElements, cofactor: Float[Array, "5 5"]
+) -> Float[Array, ""]:
+    """The largest cofactor of an element in rad, of the base over its length."""
+    return jnp.max(jnp.diagonal(degeneracy.in_radians(elements, cofactor)[0]))
+
+
+def _is_weak(
+    weakest: Float[Array, ""], direction: WorstDirection, description: Description
+) -> Bool[Array, ""]:
+    """Whether the points determine the pose too weakly for their errors."""
+    noise = description.noise
+    deviates = noise.size**2 * weakest > WEAK**2
+    return deviates | (direction.margin < noise.least_margin)
+
+
+def _elements_undefined(
+    problem: Problem, description: Description, weakest: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether the elements that were asked for do not exist at the pose, or are far
+    less certain than it."""
+    pose = description.pose
+    base = pose.bx, pose.by, pose.bz
+    variance = _largest_variance(description.elements, description.cofactor)
+    missing = ~problem.elements.exist(base, description.length)
+    uncertain = description.noise.size**2 * variance > WEAK**2
+    # without redundancy there is no noise to judge by
+    rounding = degeneracy.ROUNDING**2 * variance > weakest
+    return missing | uncertain | rounding
+
+
+def _twin_fits(
+    pair: Pair, solution: Solution, description: Description
+) -> Bool[Array, ""]:
+    """Whether the second pose, which exists if the points lie in a plane, fits them as
+    well; whether they do, its Σ r² tells."""
+    start, adjustment = solution
+    inspection, noise = description.inspection, description.noise
+    solved = adjustment.result == results.RESULTS.successful
+    asked = inspection.twin & (noise.freedom > 0) & ~start.ambiguous & solved
+    fixed_pair, fixed_pose = lax.stop_gradient((pair, description.pose))
+    squares = planes.second_squares(fixed_pair, fixed_pose, asked)
+    sigma = jnp.where(inspection.sigma > 0, inspection.sigma, 1.0)
+    rounding = planes.ROUNDING * pair.count * (pair.focal_left / sigma) ** 2
+    best = noise.freedom * description.sigma0**2
+    return squares <= noise.tolerated(best) + rounding
