@@ -19,7 +19,9 @@ import jaxro
 from jaxro.geometry import coplanarity
 from jaxro.orientation.orient import orient_near
 from jaxro.orientation.problem import Problem
-from jaxro.xla.programs import QUICKEST, known, prompt, whole
+from jaxro.xla.kernels import one_kernel
+from jaxro.xla.programs import jit_in_this_thread
+from jaxro.xla.settings import COMPILE_FASTEST, known_settings
 
 from . import peers
 from .common import (
@@ -227,10 +229,12 @@ def latencies(calls: int) -> dict[str, float]:
     pair = jax.device_put(pair_of(tuple(c[0] for c in aerial(1, 16))))
     near = partial(orient_near, problem=Problem())
     ways: dict[str, Callable] = {
-        "compiled function, pose": prompt(
-            whole(lambda pair: near(pair)[0].pose), known(QUICKEST)
+        "compiled function, pose": jit_in_this_thread(
+            one_kernel(lambda pair: near(pair)[0].pose), known_settings(COMPILE_FASTEST)
         ),
-        "compiled function, whole Orientation": prompt(whole(near), known(QUICKEST)),
+        "compiled function, whole Orientation": jit_in_this_thread(
+            one_kernel(near), known_settings(COMPILE_FASTEST)
+        ),
         "orient(pair)": jaxro.orient,
         "jit(orient)(pair)": jax.jit(jaxro.orient),
     }

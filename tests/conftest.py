@@ -38,12 +38,12 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 import jax  # noqa: E402
 
-from jaxro.xla import programs  # noqa: E402
+from jaxro.xla import settings  # noqa: E402
 
 # what JAX keeps of the programs would be looked through at every collection: a
 # sixteenth of the time
 gc.disable()
-programs.QUICK.update(programs.QUICKEST)
+settings.COMPILE_FAST.update(settings.COMPILE_FASTEST)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

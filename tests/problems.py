@@ -13,12 +13,12 @@ import jaxro
 from jaxro import DependentElements, IndependentElements, Pair, RelativePose, pair
 from jaxro.experiments import dorozhinsky1971
 from jaxro.geometry import mock_pairs
-from jaxro.xla.programs import QUICK, known
+from jaxro.xla.settings import COMPILE_FAST, known_settings
 
 orient = jaxro.orient
 """Compiled once per element system, residual and shape for the whole run of tests."""
 
-jit = partial(jax.jit, compiler_options=known(QUICK))
+jit = partial(jax.jit, compiler_options=known_settings(COMPILE_FAST))
 """For large programs that run once."""
 
 SYSTEMS = (RelativePose, IndependentElements, DependentElements)

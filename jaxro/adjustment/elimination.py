@@ -19,7 +19,7 @@ import numpy as np
 from jax.ops import segment_sum
 from jaxtyping import Array, Float, Int
 
-from ..xla.programs import traced
+from ..xla.programs import is_traced
 from . import normal_equations as normal, symmetric
 from .blocks import Families, Linearised, dimension, members
 from .terms import Term
@@ -110,7 +110,7 @@ def layout(
         raise ValueError(f"adjust: no condition touches the parameters {sorted(idle)}")
     for term in terms:
         for name, member in term.touches:
-            if not traced(member) and not np.all(
+            if not is_traced(member) and not np.all(
                 np.isin(member, np.arange(members(families[name])))
             ):
                 raise ValueError(

@@ -20,8 +20,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from ..xla.pointwise import pointwise
-from ..xla.programs import part
+from ..xla.kernels import kernel_part
+from ..xla.passes import pointwise
 from . import normal_equations as normal
 from .guarded import root, times
 from .joint import adjust_jointly
@@ -124,7 +124,7 @@ def _adjust_unrolled(
     solve = lambda origin, residuals: normal.minimise(
         residuals, origin, solver, max_steps
     )
-    solution = part(solve)(origin, residuals)
+    solution = kernel_part(solve)(origin, residuals)
     solved = start.moved(solution.value).normalised()
     converged = solution.result == optx.RESULTS.successful
     at_solution = Residuals(residuals.term, solved)

@@ -39,7 +39,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..xla.reductions import total
+from ..xla.passes import total
 from .losses import AbstractLoss
 
 Scalar = Float[Array, ""]

@@ -21,8 +21,8 @@ from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..xla.programs import part, stage
-from ..xla.reductions import sums
+from ..xla.kernels import computed_once, kernel_part
+from ..xla.passes import sums
 from . import symmetric
 
 Scalar = Float[Array, ""]
@@ -203,7 +203,7 @@ def solve(n: Lower, h: Scalars) -> list[Scalar]:
     """N⁻¹ h."""
     if len(h) > UNROLLED:
         return list(symmetric.inverse(dense(n)).matrix @ jnp.stack(list(h)))
-    return stage(lambda n, h: substitute(cholesky(n)[0], h))(n, h)
+    return computed_once(lambda n, h: substitute(cholesky(n)[0], h))(n, h)
 
 
 def correction(
@@ -376,6 +376,6 @@ def steps(
             frozenset(),
         )[0]
 
-    return part(
+    return kernel_part(
         lambda x: body(0, x) if count == 1 else lax.fori_loop(0, count, body, x)
     )(x)

@@ -21,7 +21,7 @@ from ..adjustment.guarded import root
 from ..geometry.mock_pairs import planted
 from ..geometry.pairs import Pair
 from ..orientation.orient import orient
-from ..xla.reductions import total
+from ..xla.passes import total
 from .propagation import jacobian
 from .sensitivity import Quantity, heights, run
 

@@ -24,8 +24,8 @@ from ..geometry.elements import (
 from ..geometry.linear import Linear, Values
 from ..geometry.pairs import Coordinates, Pair
 from ..orientation.result import Orientation
-from ..xla.programs import stage
-from ..xla.reductions import sums
+from ..xla.kernels import computed_once
+from ..xla.passes import sums
 
 
 class Effects(NamedTuple):
@@ -54,7 +54,7 @@ def effects(
     rows, placed, slopes = _of_parameters(orientation)
     # the rays are brought together again by -Q Bᵀ / d times what is left of the jump
     left = pair.sigma**2 * linear.weight * redundancy * jump
-    z, common, by_coordinate = stage(_heights)(
+    z, common, by_coordinate = computed_once(_heights)(
         pair, orientation.pose, linear, placed, slopes, shift, left
     )
     scale = _length(pair, orientation, z)
@@ -62,11 +62,13 @@ def effects(
         jnp.abs(slope * jump / jnp.where(b != 0, b, 1.0) + common) * scale
         for slope, b in zip(by_coordinate, linear.gradient, strict=True)
     )
-    on_elements = stage(lambda rows, shift: [jnp.abs(dot(row, shift)) for row in rows])(
-        rows, shift
-    )
+    on_elements = computed_once(
+        lambda rows, shift: [jnp.abs(dot(row, shift)) for row in rows]
+    )(rows, shift)
     return Effects(
-        on_elements, stage(_on_m_q)(pair, orientation, linear, shift, jump), height
+        on_elements,
+        computed_once(_on_m_q)(pair, orientation, linear, shift, jump),
+        height,
     )
 
 
@@ -103,7 +105,7 @@ def _of_parameters(orientation: Orientation):
         )
         return placed, [push(*unit(k)) for k in range(5)]
 
-    placed, slopes = stage(linearly)(orientation.pose, length)
+    placed, slopes = computed_once(linearly)(orientation.pose, length)
     return (
         [[values[i] for values, _ in slopes] for i in range(5)],
         placed,

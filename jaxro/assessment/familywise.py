@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..adjustment import critical_values as critical
-from ..xla.programs import stage, while_loop
+from ..xla.kernels import computed_once, while_loop
 from .correlations import Normalised
 
 DRAWS = 1024
@@ -114,7 +114,7 @@ def _largest(
 ) -> Float[Array, ""]:
     def found(normalised: Normalised) -> Float[Array, ""]:
         few = _few(normalised)
-        number, at = jnp.maximum(_count(few), 1.0), stage(value)
+        number, at = jnp.maximum(_count(few), 1.0), computed_once(value)
         for _ in range(TURNS):
             number = _number(few, at(number), drawn)
         return at(number)

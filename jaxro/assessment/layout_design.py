@@ -33,8 +33,9 @@ from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import AbstractElements, DependentElements, vertical
 from ..geometry.mock_pairs import Layout, mock_pair
 from ..geometry.pairs import Pair
-from ..xla.programs import QUICK, Program, traced
-from ..xla.reductions import total
+from ..xla.passes import total
+from ..xla.programs import Program, is_traced
+from ..xla.settings import COMPILE_FAST
 
 Positions = tuple[Float[Array, "point"], Float[Array, "point"]]
 """x and y in the ideal vertical left photo, in its unit."""
@@ -313,7 +314,7 @@ def design(
             "those kept"
         )
     for axis, side in (("x", overlap.x), ("y", overlap.y)):
-        if not traced(side) and not 0 < np.ptp(np.asarray(side, float)) < np.inf:
+        if not is_traced(side) and not 0 < np.ptp(np.asarray(side, float)) < np.inf:
             raise ValueError(
                 f"design: the overlap has {axis} = {side}; it must be an interval"
             )
@@ -329,8 +330,8 @@ def design(
     options = arguments | {"points": points, "starts": starts}
     return (
         _design(key, **options)
-        if traced((key, arguments))
-        else Program(_design, options, QUICK)(key)
+        if is_traced((key, arguments))
+        else Program(_design, options, COMPILE_FAST)(key)
     )
 
 

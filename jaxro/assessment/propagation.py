@@ -18,8 +18,8 @@ from ..adjustment.guarded import root
 from ..adjustment.least_squares import Adjustment
 from ..adjustment.parameters import as_given, as_parameters
 from ..orientation.result import Orientation
-from ..xla.programs import traced
-from ..xla.reductions import total
+from ..xla.passes import total
+from ..xla.programs import is_traced
 
 ROUNDING = 1e-9
 """Of the sum of all parts of a variance: as much below zero as it may come out by
@@ -70,7 +70,7 @@ def propagate(function: Callable, values: PyTree, covariance: ArrayLike) -> Prop
             f"propagate: {flat.size} values need a covariance of as many rows, got "
             f"shape {c.shape}"
         )
-    if c.ndim == 2 and not traced(c):
+    if c.ndim == 2 and not is_traced(c):
         _check_symmetric(np.asarray(c))
     of = lambda j, c: (j * c[None, :] if c.ndim == 1 else j @ c) @ j.T
     spread = of(j, c)

@@ -36,8 +36,10 @@ from ..adjustment.normal_equations import accumulate, inverse
 from ..geometry.linear import Linear, linearised
 from ..geometry.pairs import Coordinates, Pair, cleaned
 from ..orientation.result import Orientation
-from ..xla.programs import QUICK, Program, stage, traced
-from ..xla.reductions import count
+from ..xla.kernels import computed_once
+from ..xla.passes import count
+from ..xla.programs import Program, is_traced
+from ..xla.settings import COMPILE_FAST
 from .external_reliability import effects
 
 PerPoint = Float[Array, "*pairs point"]
@@ -276,9 +278,9 @@ def assess(
         "power": power,
         "familywise": familywise,
     }
-    if traced((pair, orientation, sigma0)):
+    if is_traced((pair, orientation, sigma0)):
         return _assess((pair, orientation), **options)
-    return Program(_assess, options, QUICK)((pair, orientation))
+    return Program(_assess, options, COMPILE_FAST)((pair, orientation))
 
 
 def _assess(
@@ -292,7 +294,7 @@ def _assess(
     pair, orientation = cleaned(read[0])[0], read[1]
     use = pair.mask & orientation.usable
     linear = linearised(pair, orientation.pose)
-    z, h, squares = stage(_solved)(linear)
+    z, h, squares = computed_once(_solved)(linear)
     r = jnp.where(use, 1 - h, 0.0)
     points = count(use)
     freedom = jnp.where(points > 5, points - 5, 0.0)
@@ -309,7 +311,7 @@ def _assess(
     delta, limit, each = (critical.looked_up(table, points) for table in tests)
     # of g: delta sigma0 sqrt(D / r), and what it does to the local parameters of the
     # pose
-    jump, shift = stage(_moved)(
+    jump, shift = computed_once(_moved)(
         z, linear.weight, jnp.where(testable, delta * unit * spread / safe, 0.0)
     )
     parts = tuple(b**2 * pair.sigma**2 * linear.weight * r for b in linear.gradient)
@@ -357,7 +359,7 @@ def _solved(linear: Linear):
     )
     # five products a point by the inverse, where every entry of a substitution would
     # repeat those before it
-    q, _ = stage(inverse)(n)
+    q, _ = computed_once(inverse)(n)
     z = [
         sum(q[max(i, j)][min(i, j)] * c for j, c in enumerate(linear.columns))
         for i in range(5)

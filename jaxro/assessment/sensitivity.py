@@ -27,8 +27,9 @@ from ..geometry.pairs import Pair
 from ..orientation.orient import orient
 from ..orientation.result import Orientation
 from ..orientation.results import is_usable
-from ..xla.programs import QUICK, Program, traced
-from ..xla.reductions import total
+from ..xla.passes import total
+from ..xla.programs import Program, is_traced
+from ..xla.settings import COMPILE_FAST
 from .propagation import jacobian
 
 Quantity = Callable[[Orientation], PyTree]
@@ -140,14 +141,14 @@ def run(
     derivatives."""
     if options.get("base") is not None:
         options = options | {"base": jnp.asarray(options["base"], float)}
-    if traced((pair, options, more)):
+    if is_traced((pair, options, more)):
         return function(pair, **options, **more)
     if "start" not in options:
         found = orient(pair, **options)
         options = options | {"start": found.pose}
         if "max_steps" in options and not bool(found.usable):
             options["max_steps"] = 0  # as many again might find what so many did not
-    return Program(function, options | more, QUICK)(pair)
+    return Program(function, options | more, COMPILE_FAST)(pair)
 
 
 class PointInfluence(NamedTuple):

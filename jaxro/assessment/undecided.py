@@ -23,8 +23,8 @@ from ..adjustment import critical_values
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearised
 from ..geometry.pairs import Pair
-from ..xla.programs import while_loop
-from ..xla.reductions import count
+from ..xla.kernels import while_loop
+from ..xla.passes import count
 from .correlations import UNTESTABLE, Normalised, normalised, orthonormal
 
 Use = Bool[Array, "point"]

@@ -27,8 +27,8 @@ from ..adjustment import normal_equations as normal
 from ..geometry.linear import Linear, linearised
 from ..geometry.pairs import Pair, cleaned
 from ..orientation.result import Orientation
-from ..xla.programs import Program, traced
-from ..xla.reductions import sums, total
+from ..xla.passes import sums, total
+from ..xla.programs import Program, is_traced
 
 SURE = 0.5
 """Standard error of a variance, relative to the pooled variance, above which the group
@@ -97,7 +97,7 @@ def estimate(
             f"got {names}"
         )
     labels = tuple(labels)
-    if traced((pairs, orientations)):
+    if is_traced((pairs, orientations)):
         return _estimate(
             (pairs, orientations), labels=labels, size=len(names), steps=steps
         )

@@ -21,7 +21,7 @@ from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, cleaned
 from ..orientation.results import is_usable
 from ..rejection import AbstractProcedure, Rejection
-from ..xla.reductions import count
+from ..xla.passes import count
 from .batch import map_batch
 
 

@@ -26,17 +26,16 @@ from ..orientation.starts import AbstractStart, Auto
 from ..rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
 from ..rejection.hypotheses import AbstractHypotheses
 from ..rejection.search import Search
-from ..xla.programs import (
-    FAST,
-    QUICK,
-    QUICKEST,
-    UNDIVIDED,
-    WIDE,
-    Program,
-    whole,
-    whole_of_many,
+from ..xla.kernels import one_kernel, one_kernel_fusing_points
+from ..xla.programs import Program
+from ..xla.settings import (
+    COMPILE_FAST,
+    COMPILE_FASTEST,
+    RUN_FAST,
+    UNSPLIT_LOOPS,
+    WIDE_VECTORS,
 )
-from ..xla.slabs import Report, Way, chunked, spread, unheard
+from ..xla.slabs import Progress, Split, map_chunks, silent, spread
 
 CHUNK_POINTS = 16384
 """Points per chunk: a working set of a few hundred kB, which stays in the cache of one
@@ -78,7 +77,7 @@ def orient_batch(
     *,
     select: Callable[[Orientation], PyTree] = _everything,
     read: Callable[[Pair, Orientation], PyTree] | None = None,
-    progress: Report | None = None,
+    progress: Progress | None = None,
     threads: int | None = None,
     chunk: int | None = None,
     start: AbstractStart | Any = Auto(),  # noqa: B008 (frozen)
@@ -99,18 +98,18 @@ def orient_batch(
         raise ValueError(
             "select and read exclude each other; read sees the orientation, too"
         )
-    host, report = jax.tree.map(np.asarray, double(pairs)), progress or unheard
-    way = Way(threads, chunk)
+    host, report = jax.tree.map(np.asarray, double(pairs)), progress or silent
+    split = Split(threads, chunk)
     problem = problem_of_all(options | {"start": start})
     read = Selected(select) if read is None else read
     if not isinstance(start, Auto):
-        return _finish(orient_slabs(host, problem, read, way, report))
-    out, fits = orient_slabs_near(host, problem, read, way, report)
+        return _finish(orient_slabs(host, problem, read, split, report))
+    out, fits = orient_slabs_near(host, problem, read, split, report)
     rest = np.flatnonzero(~fits)
     if rest.size:
         left_over = jax.tree.map(lambda a: a[rest], host)
         general = problem.starting(start.general)
-        out = _replace_rows(out, rest, orient_slabs(left_over, general, read, way))
+        out = _replace_rows(out, rest, orient_slabs(left_over, general, read, split))
     return _finish(out)
 
 
@@ -133,36 +132,39 @@ def orient_slabs(
     pairs: Pair,
     problem: Problem,
     read: Callable[[Pair, Orientation], PyTree],
-    way: Way = Way(),  # noqa: B008 (frozen)
-    report: Report = unheard,
+    split: Split = Split(),  # noqa: B008 (frozen)
+    report: Progress = silent,
 ) -> PyTree:
     """read(pair, orientation) of every pair, in NumPy."""
-    chunk = _chunk(pairs, way.chunk)
+    chunk = _chunk(pairs, split.chunk)
     options = {"problem": problem, "read": read, "chunk": chunk}
     program = Program(_slab, options, _settings(pairs))
-    return spread(pairs, program, way, chunk, report)
+    return spread(pairs, program, split, chunk, report)
 
 
 def orient_slabs_near(
     pairs: Pair,
     problem: Problem,
     read: Callable[[Pair, Orientation], PyTree],
-    way: Way = Way(),  # noqa: B008 (frozen)
-    report: Report = unheard,
+    split: Split = Split(),  # noqa: B008 (frozen)
+    report: Progress = silent,
 ) -> tuple[PyTree, np.ndarray]:
     """The same from the vertical, and for which pairs that fits; `problem.start` is an
     `Auto`."""
-    chunk = _chunk(pairs, way.chunk)
+    chunk = _chunk(pairs, split.chunk)
     options = {"problem": problem, "read": read, "chunk": chunk}
     if pairs.x_left.size <= ALONE:
-        way = way._replace(threads=way.threads or 1, calls=0)
-        kernel, lasting = whole, FAST | WIDE
+        split = split._replace(threads=split.threads or 1, calls=0)
+        kernel, lasting = one_kernel, RUN_FAST | WIDE_VECTORS
     else:
-        way = way._replace(calls=1)  # all take as long
-        kernel, lasting = whole_of_many, FAST | WIDE | UNDIVIDED
+        split = split._replace(calls=1)  # all take as long
+        kernel, lasting = (
+            one_kernel_fusing_points,
+            RUN_FAST | WIDE_VECTORS | UNSPLIT_LOOPS,
+        )
     kernel = kernel if problem.solver is None else None
     program = Program(_slab_near, options, _settings(pairs, lasting), kernel=kernel)
-    return spread(pairs, program, way, chunk, report)
+    return spread(pairs, program, split, chunk, report)
 
 
 def _replace_rows(out: PyTree, rows: np.ndarray, new: PyTree) -> PyTree:
@@ -182,7 +184,7 @@ def clean_batch(
     procedure: AbstractProcedure,
     *,
     select: Callable[[Rejection], PyTree] = _everything,
-    progress: Report | None = None,
+    progress: Progress | None = None,
     threads: int | None = None,
     chunk: int | None = None,
 ) -> PyTree:
@@ -192,9 +194,9 @@ def clean_batch(
     `select=lambda r: r.mask` computes no log and no statistics that the decision does
     not need.
     """
-    host, report = jax.tree.map(np.asarray, double(pairs)), progress or unheard
-    way = Way(threads, chunk)
-    out = clean_in_stages(host, procedure, select, way, report)
+    host, report = jax.tree.map(np.asarray, double(pairs)), progress or silent
+    split = Split(threads, chunk)
+    out = clean_in_stages(host, procedure, select, split, report)
     return _finish(out)
 
 
@@ -212,19 +214,19 @@ def clean_in_stages(
     pairs: Pair,
     procedure: AbstractProcedure,
     select: Callable[[Rejection], PyTree],
-    way: Way,
-    report: Report,
+    split: Split,
+    report: Progress,
 ) -> PyTree:
     """What is selected of every pair's rejection, in NumPy: the stages in turn, each
     for the pairs left in doubt."""
     first, *others = stages(procedure, pairs.x_left.shape[-1])
-    out, again = clean_slabs(pairs, first, select, way, report)
+    out, again = clean_slabs(pairs, first, select, split, report)
     for stage in others:
         rest = np.flatnonzero(again)
         if rest.size:
             left_over = jax.tree.map(lambda a, rest=rest: a[rest], pairs)
             out, again = _replace_rows(
-                (out, again), rest, clean_slabs(left_over, stage, select, way, unheard)
+                (out, again), rest, clean_slabs(left_over, stage, select, split, silent)
             )
     return out
 
@@ -233,29 +235,29 @@ def clean_slabs(
     pairs: Pair,
     procedure: AbstractProcedure,
     select: Callable[[Rejection], PyTree],
-    way: Way,
-    report: Report,
+    split: Split,
+    report: Progress,
 ) -> tuple[PyTree, np.ndarray]:
     """What is selected of every pair's rejection, in NumPy, and for which pairs the
     procedure was in doubt."""
-    chunk = _chunk(pairs, way.chunk)
+    chunk = _chunk(pairs, split.chunk)
     # a search has many subsets of each pair in work, and goes on until the last pair of
     # its chunk is served
-    if way.chunk is None:
+    if split.chunk is None:
         chunk = min(chunk, _searched_together(procedure))
     program = Program(
         _slab_cleaned,
         {"procedure": procedure, "select": select, "chunk": chunk},
         _settings(pairs),
     )
-    return spread(pairs, program, way, chunk, report)
+    return spread(pairs, program, split, chunk, report)
 
 
 def map_batch(
     function: Callable[[Pair], PyTree],
     pairs: Pair,
     *,
-    progress: Report | None = None,
+    progress: Progress | None = None,
     threads: int | None = None,
     chunk: int | None = None,
 ) -> PyTree:
@@ -271,8 +273,8 @@ def map_batch(
     program = Program(
         _slab_mapped, {"function": function, "chunk": chunk}, _settings(pairs)
     )
-    host, way = jax.tree.map(np.asarray, pairs), Way(threads, chunk)
-    return _finish(spread(host, program, way, chunk, progress or unheard))
+    host, split = jax.tree.map(np.asarray, pairs), Split(threads, chunk)
+    return _finish(spread(host, program, split, chunk, progress or silent))
 
 
 def _searched_together(procedure: AbstractProcedure) -> int:
@@ -305,20 +307,20 @@ def _settings(pairs: Pair, lasting: dict[str, Any] | None = None) -> dict[str, A
     what takes long to compile."""
     points = pairs.x_left.size
     if points <= MOMENT:
-        return QUICKEST
+        return COMPILE_FASTEST
     if lasting is not None:
         return lasting
     if points <= SOON:
-        return QUICK
-    return FAST if pairs.x_left.shape[1] > FEW else FAST | WIDE
+        return COMPILE_FAST
+    return RUN_FAST if pairs.x_left.shape[1] > FEW else RUN_FAST | WIDE_VECTORS
 
 
 def _slab(pairs: Pair, *, problem: Problem, read: Callable, chunk: int) -> PyTree:
-    return chunked(lambda pair: read(pair, orient_once(pair, problem)), pairs, chunk)
+    return map_chunks(lambda pair: read(pair, orient_once(pair, problem)), pairs, chunk)
 
 
 def _slab_mapped(pairs: Pair, *, function: Callable, chunk: int) -> PyTree:
-    return chunked(function, pairs, chunk)
+    return map_chunks(function, pairs, chunk)
 
 
 def _slab_near(
@@ -328,7 +330,7 @@ def _slab_near(
         orientation, fits = orient_near(pair, problem)
         return read(pair, orientation), fits
 
-    return chunked(one, pairs, chunk)
+    return map_chunks(one, pairs, chunk)
 
 
 def _slab_cleaned(
@@ -340,7 +342,7 @@ def _slab_cleaned(
         rejection = procedure(pair)
         return select(rejection), rejection.outcome == OUTCOMES.no_consensus
 
-    return chunked(one, pairs, chunk)
+    return map_chunks(one, pairs, chunk)
 
 
 def _finish(out: PyTree) -> PyTree:

@@ -17,15 +17,13 @@ from ..geometry.pairs import Pair, double, pair
 from ..orientation.result import Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..rejection import AbstractProcedure, Rejection
+from ..xla.slabs import Progress, Split, silent
 from .batch import (
-    Report,
-    Way,
     clean_slabs,
     orient_slabs,
     orient_slabs_near,
     problem_of_all,
     stages,
-    unheard,
 )
 from .padding import Plan, planned
 
@@ -187,7 +185,7 @@ def orient_ragged(
     *,
     read: Callable[[Pair, Orientation], tuple[PyTree, PyTree]] = split,
     plan: Plan | None = None,
-    progress: Report | None = None,
+    progress: Progress | None = None,
     threads: int | None = None,
     start: AbstractStart | Any = Auto(),  # noqa: B008 (frozen)
     **options,
@@ -207,24 +205,24 @@ def orient_ragged(
     batches = _batches(pairs, plan.sizes, plan.slabs, threads)
     in_turn = threads == 1 or len(batches) == 1
     told = (
-        out.told if in_turn else unheard
+        out.told if in_turn else silent
     )  # what runs beside the calling thread tells nobody
 
     def near(
-        members: np.ndarray, size: int, way: Way
+        members: np.ndarray, size: int, slabs: Split
     ) -> tuple[np.ndarray, int, PyTree, np.ndarray]:
         found, fits = orient_slabs_near(
-            pairs.padded(members, size), problem, read, way, told
+            pairs.padded(members, size), problem, read, slabs, told
         )
         return members, size, found, members[~fits]
 
     def given(
-        members: np.ndarray, size: int, way: Way
+        members: np.ndarray, size: int, slabs: Split
     ) -> tuple[np.ndarray, int, PyTree, np.ndarray]:
         return (
             members,
             size,
-            orient_slabs(pairs.padded(members, size), problem, read, way, told),
+            orient_slabs(pairs.padded(members, size), problem, read, slabs, told),
             members[:0],
         )
 
@@ -237,10 +235,10 @@ def orient_ragged(
             out.told(len(members), len(members))
         rest.append(left)
     general = problem.starting(start.general) if isinstance(start, Auto) else problem
-    for members, size, way in _batches(
+    for members, size, slabs in _batches(
         pairs, plan.fewer, None, threads, np.concatenate(rest)
     ):
-        again = orient_slabs(pairs.padded(members, size), general, read, way)
+        again = orient_slabs(pairs.padded(members, size), general, read, slabs)
         out.store(members, size, again)
     return eqx.combine(*out.tree) if read is split else out.tree
 
@@ -273,7 +271,7 @@ def clean_ragged(
     *,
     select: Callable[[Rejection], tuple[PyTree, PyTree]] = decisions,
     plan: Plan | None = None,
-    progress: Report | None = None,
+    progress: Progress | None = None,
     threads: int | None = None,
 ) -> PyTree:
     """`procedure` of pairs of any lengths, on all cores: its `Decisions`, flat, in the
@@ -289,19 +287,19 @@ def clean_ragged(
     doubtful = [
         [np.zeros(0, int)] for _ in every
     ]  # by the number of procedures that are left for a pair
-    for members, size, way in _batches(pairs, plan.sizes, None, threads):
+    for members, size, slabs in _batches(pairs, plan.sizes, None, threads):
         first, *others = stages(procedure, size)
         found, doubt = clean_slabs(
-            pairs.padded(members, size), first, select, way, out.told
+            pairs.padded(members, size), first, select, slabs, out.told
         )
         out.store(members, size, found)
         doubtful[len(others)].append(members[doubt])
     for left in range(len(every) - 1, 0, -1):
-        for members, size, way in _batches(
+        for members, size, slabs in _batches(
             pairs, plan.fewer, None, threads, np.concatenate(doubtful[left])
         ):
             found, doubt = clean_slabs(
-                pairs.padded(members, size), every[-left], select, way, unheard
+                pairs.padded(members, size), every[-left], select, slabs, silent
             )
             out.store(members, size, found)
             doubtful[left - 1].append(members[doubt])
@@ -337,15 +335,15 @@ def _batches(
     slabs: tuple[int, ...] | None,
     threads: int | None,
     members: Int[np.ndarray, " some"] | None = None,
-) -> list[tuple[np.ndarray, int, Way]]:
-    """(members, size to pad them to, way) of each size; of all pairs or of some.
+) -> list[tuple[np.ndarray, int, Split]]:
+    """(members, size to pad them to, slabs) of each size; of all pairs or of some.
     Without `slabs` a call takes one chunk."""
     members = np.arange(len(pairs.lengths)) if members is None else np.sort(members)
     bucket = np.searchsorted(sizes, pairs.lengths[members])
     every = [members[bucket == number] for number in range(len(sizes))]
     calls = slabs or (1,) * len(sizes)
     return [
-        (own, size, Way(threads, slab=call))
+        (own, size, Split(threads, slab=call))
         for own, size, call in zip(every, sizes, calls, strict=True)
         if own.size
     ]
@@ -367,9 +365,9 @@ def _overlapping(work: Callable, batches: Sequence[tuple]) -> Iterator[tuple]:
 class _Out:
     """The results of all pairs, filled batch by batch, and how many are done."""
 
-    def __init__(self, pairs: Ragged, progress: Report | None):
+    def __init__(self, pairs: Ragged, progress: Progress | None):
         self.tree: Any = None
-        self._pairs, self._progress, self._before = pairs, progress or unheard, 0
+        self._pairs, self._progress, self._before = pairs, progress or silent, 0
 
     def told(self, done: int, total: int) -> None:
         """Progress within one batch."""

@@ -36,7 +36,7 @@ from ..rejection.hypotheses import squares
 from ..rejection.noise import PARAMETERS
 from ..rejection.search import Search
 from ..rejection.thorough import Thorough
-from ..xla.reductions import count, sums, total
+from ..xla.passes import count, sums, total
 from .batch import map_batch
 from .padding import sizes
 from .ragged import Ragged, join

@@ -13,7 +13,7 @@ from ..batches.buckets import buckets
 from ..batches.padding import FEWER
 from ..geometry.pairs import Pair
 from ..xla.programs import Program
-from ..xla.slabs import Way, chunked, spread
+from ..xla.slabs import Split, map_chunks, spread
 from .cameras import PhotoPoints
 from .two_view import ENGINE, Found, Verdict, classified, verdict
 
@@ -24,7 +24,7 @@ PAIRS = 48
 """Pairs in one call of a program: enough to hide the .3 ms that a call costs, few
 enough to share out among threads."""
 
-ONE_BY_ONE = Way(slab=PAIRS, chunk=1)
+ONE_BY_ONE = Split(slab=PAIRS, chunk=1)
 """A pair is work enough by itself: it waits for no other one, and without `vmap` the
 programs compile a third sooner.
 """
@@ -86,7 +86,7 @@ def _found(
 
 
 def _all_classified(verdicts: tuple[Pair, Verdict]) -> Found:
-    return chunked(lambda one: classified(*one), verdicts, 1)
+    return map_chunks(lambda one: classified(*one), verdicts, 1)
 
 
 def batch(block: Block, points: PhotoPoints, size: int, sigma: float) -> Pair:

@@ -33,8 +33,8 @@ from ..orientation.starts.general import rotation_only
 from ..rejection import OUTCOMES, Recommended, Rejection, evidence
 from ..rejection.hypotheses import squares, vectors
 from ..rejection.robust import agreeing, in_front, parallel, seen
-from ..xla.programs import while_loop
-from ..xla.reductions import count, total
+from ..xla.kernels import while_loop
+from ..xla.passes import count, total
 
 ENGINE = Recommended()
 """The procedure that decides on pose and matches; the standard deviations are those of

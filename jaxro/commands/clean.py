@@ -21,7 +21,8 @@ from ..reports.terminal import consoles, progress
 from ..reports.verdicts import Verdict
 from ..tables.examples import mock_pair as mock_example
 from ..tables.fields import TableError
-from ..xla.programs import QUICK, Program
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
 from . import orient as jobs, sigma
 from .orient import Example, Job, Options
 from .tolerances import changed, check_sigma, tolerances
@@ -111,7 +112,7 @@ def clean_all(
             found,
             log,
             oriented,
-            Program(_parallaxes, {}, QUICK)((pair, oriented.orientation.pose)),
+            Program(_parallaxes, {}, COMPILE_FAST)((pair, oriented.orientation.pose)),
         )
 
     def many(batch: Pair, progress: Callable[[int, int], None]):

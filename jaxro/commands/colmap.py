@@ -27,7 +27,7 @@ from ..colmap.two_view import Found, Kind
 from ..reports.terminal import consoles, progress
 from ..reports.text import number, table
 from ..tables.fields import TableError
-from ..xla.programs import uncollected
+from ..xla.programs import pause_collection
 
 CONFIG = {
     Kind.oriented: 2,
@@ -98,7 +98,7 @@ def run(options: Options) -> bool:
     return all(kind in GOOD for kind in summary.pairs)
 
 
-@uncollected()
+@pause_collection()
 def orient_database(
     options: Options, told: Callable[..., None] = lambda done, total: None
 ) -> Summary:

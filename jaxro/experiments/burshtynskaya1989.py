@@ -31,7 +31,8 @@ from ..geometry import mock_pairs
 from ..geometry.mock_pairs import noisy, planted
 from ..geometry.pairs import Pair
 from ..rejection import AbstractProcedure, Rejection, TwoStage
-from ..xla.programs import QUICK, Program
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
 from . import burshtynskaya1989_conclusions as conclusions
 from .burshtynskaya1989_conclusions import Conclusions
 
@@ -148,7 +149,7 @@ def run(
     limits = np.array([CLASSES[name][:2] for name in classes])
     key, planned = jax.random.key(seed), conclusions.plan()
     drawn = jax.random.split(key, variants), jnp.asarray(errors), jnp.asarray(limits)
-    pairs, wrong = Program(_simulated, {}, QUICK)(
+    pairs, wrong = Program(_simulated, {}, COMPILE_FAST)(
         (drawn, jnp.asarray(planned.errors), jax.random.fold_in(key, 1989))
     )
     wrong = np.asarray(wrong)

@@ -28,7 +28,8 @@ from ..geometry.pairs import Pair
 from ..orientation.orient import orient
 from ..orientation.results import is_usable
 from ..rejection import OUTCOMES, AbstractProcedure, Rejection
-from ..xla.programs import QUICK, Program
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
 from .calibration import Calibration, adjustable, calibrated
 
 LEAST = 6
@@ -172,7 +173,7 @@ def simulated(
         f"{setting.layout} {setting.errors} {setting.size} {use}".encode()
     )
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), place), trials)
-    pairs, wrong = Program(_simulated, {}, QUICK)(
+    pairs, wrong = Program(_simulated, {}, COMPILE_FAST)(
         (exact, keys, jnp.asarray(setting.errors), jnp.asarray(setting.size))
     )
     return pairs, np.asarray(wrong)
@@ -202,7 +203,7 @@ def _judged(
     """The estimates of a `Score`, in its order."""
     kept, order, pose, usable, finished = clean_batch(pairs, procedure, select=_seen)
     angle, usable = (
-        np.asarray(Program(_angles, {}, QUICK)((truth, pose))),
+        np.asarray(Program(_angles, {}, COMPILE_FAST)((truth, pose))),
         np.asarray(usable),
     )
     out = np.asarray(pairs.mask & ~kept)

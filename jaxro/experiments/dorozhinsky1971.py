@@ -23,7 +23,8 @@ from ..geometry.elements import IndependentElements
 from ..geometry.pairs import Pair, pad, stack
 from ..rejection import OUTCOMES, Dorozhinsky, base
 from ..rejection.leave_one_out_grubbs import linearised
-from ..xla.programs import QUICK, Program
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
 from .dorozhinsky1971_first_order import EQUATIONS, by_the_papers_rule
 
 ERRORS = (0.0, 0, 0, 0, 0, 0, 2.0, 2.2, -2.43, -1.90, 0, 0, 0, 0, -0.60, 2.1)
@@ -138,9 +139,9 @@ class Results:
 
 def run() -> Results:
     """Calculate all of it; the noisy pairs have a fixed seed."""
-    pairs, strict, (parallax, elements), influence = Program(_calculated, {}, QUICK)(
-        jnp.asarray(ERRORS)
-    )
+    pairs, strict, (parallax, elements), influence = Program(
+        _calculated, {}, COMPILE_FAST
+    )(jnp.asarray(ERRORS))
     q, m_q = map(np.asarray, strict)
     decisions = {
         corrections: _decisions(pairs, corrections) for corrections in READINGS

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..xla.programs import traced
-from ..xla.reductions import count, total
+from ..xla.passes import count, total
+from ..xla.programs import is_traced
 
 Coordinates = tuple[Float[Array, "*pairs point"], ...]
 """x_left, y_left, x_right, y_right"""
@@ -114,7 +114,7 @@ class Pair(eqx.Module):
     def with_mask(self, mask: Values) -> "Pair":
         """The same pair with other points taking part. Raises ValueError where the
         shapes do not agree."""
-        new = mask if traced(mask) else jax.device_put(np.array(mask, bool))
+        new = mask if is_traced(mask) else jax.device_put(np.array(mask, bool))
         if np.shape(new) != np.shape(self.mask):
             raise ValueError(
                 f"with_mask: the mask has shape {np.shape(new)}, the pair "
@@ -217,13 +217,13 @@ def pair(
 def _library(values: PyTree) -> ModuleType:
     """NumPy, which compiles nothing for each new length; of what is being traced,
     JAX's."""
-    return jnp if traced(values) else np
+    return jnp if is_traced(values) else np
 
 
 def _filled(fields: list) -> Pair:
     """A `Pair` of these arrays, which nobody else changes: their memory is not
     copied."""
-    return Pair(*(fields if traced(fields) else jax.device_put(fields)))
+    return Pair(*(fields if is_traced(fields) else jax.device_put(fields)))
 
 
 def double(one: PyTree) -> PyTree:
@@ -298,7 +298,7 @@ def unstack(batch: Pair) -> list[Pair]:
         raise ValueError(
             "unstack: a batch of pairs (pair, point) is wanted, got one pair"
         )
-    if not traced(batch):
+    if not is_traced(batch):
         batch = jax.tree.map(np.array, batch)  # what is made of it keeps its memory
     fields = jax.tree.leaves(batch)
     return [

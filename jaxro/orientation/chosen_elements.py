@@ -16,7 +16,7 @@ from ..geometry.elements import (
     to_pose,
 )
 from ..geometry.pairs import Pair
-from ..xla.reductions import total
+from ..xla.passes import total
 from .inspection import Inspection
 
 

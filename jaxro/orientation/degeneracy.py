@@ -16,8 +16,8 @@ from ..adjustment.normal_equations import inner, quadratic
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import AbstractElements
 from ..geometry.pairs import Pair
-from ..xla.programs import stage
-from ..xla.reductions import sums
+from ..xla.kernels import computed_once
+from ..xla.passes import sums
 from .inspection import Inspection
 
 ROUNDING = 1e-9
@@ -77,7 +77,7 @@ def worst_direction(
     the first know nothing of.
     """
     scaled, units = in_radians(elements, cofactor)
-    direction = stage(_worst)(scaled)
+    direction = computed_once(_worst)(scaled)
     length = jnp.sqrt(sum((e * e for e in direction), jnp.zeros(())))
     direction = [e / length * unit for e, unit in zip(direction, units, strict=True)]
     zero = jnp.zeros_like(pair.focal_left)
@@ -121,9 +121,9 @@ def worst_direction(
 
     by_entry = tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])
     _, slopes = elements.slopes(fundamental, (zero,) * 5)
-    columns = stage(lambda slopes: [inner(by_entry, slope) for slope in slopes])(
-        slopes
-    )  # Aᵀc
+    columns = computed_once(
+        lambda slopes: [inner(by_entry, slope) for slope in slopes]
+    )(slopes)  # Aᵀc
     taken = quadratic([list(row) for row in cofactor], columns)
     back = jnp.abs(sum(e * h for e, h in zip(direction, columns, strict=True)))
     straight = back <= 0

@@ -10,8 +10,7 @@ from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose, to_pose
 from ..geometry.intersection import model_point
 from ..geometry.pairs import Pair
-from ..xla.pointwise import pointwise
-from ..xla.reductions import sums
+from ..xla.passes import pointwise, sums
 from . import chosen_elements, degeneracy
 from .degeneracy import Noise
 from .inspection import Inspection, inspect

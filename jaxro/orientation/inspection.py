@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
-from ..xla.reductions import sums
+from ..xla.passes import sums
 
 ONE_SIDE = 0.5
 """Mean sign of points of which a quarter lies on the other side."""

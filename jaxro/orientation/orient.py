@@ -12,7 +12,9 @@ from ..adjustment.terms import Term
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.pairs import Pair, cleaned, double
-from ..xla.programs import QUICK, QUICKEST, Program, loops, traced, whole
+from ..xla.kernels import kernels_of_parts, one_kernel
+from ..xla.programs import Program, is_traced
+from ..xla.settings import COMPILE_FAST, COMPILE_FASTEST
 from . import starts
 from .describe import Description, describe
 from .problem import Problem
@@ -66,21 +68,21 @@ def orient(
         max_steps=max_steps,
     )
     pair = double(pair)
-    if traced((pair, problem)):
+    if is_traced((pair, problem)):
         return orient_once(pair, problem)
     if not isinstance(start, starts.Auto):
-        return _run(orient_once, pair, problem, loops)
+        return _run(orient_once, pair, problem, kernels_of_parts)
     # two small programs instead of one large: the general start is compiled when a pair
     # first needs it
-    orientation, fits = _run(orient_near, pair, problem, whole)
+    orientation, fits = _run(orient_near, pair, problem, one_kernel)
     if bool(fits):
         return orientation
-    return _run(orient_once, pair, problem.starting(start.general), loops)
+    return _run(orient_once, pair, problem.starting(start.general), kernels_of_parts)
 
 
 def _run(function: Callable, pair: Pair, problem: Problem, kernel: Callable) -> Any:
     """function(pair, problem) by a program that compiles quickly."""
-    settings = QUICKEST if pair.x_left.size <= FEW else QUICK
+    settings = COMPILE_FASTEST if pair.x_left.size <= FEW else COMPILE_FAST
     # the compiler makes no kernel of a solver of the user's, and none of no points
     as_kernel = problem.solver is None and pair.x_left.size > 0
     options = {"problem": problem}

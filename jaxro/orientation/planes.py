@@ -26,8 +26,8 @@ from ..adjustment.normal_equations import accumulate, solve, steps
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, cleaned
-from ..xla.programs import while_loop
-from ..xla.reductions import count
+from ..xla.kernels import while_loop
+from ..xla.passes import count
 from .inspection import inspect
 
 TURNS = 2

@@ -13,7 +13,8 @@ from ..adjustment.guarded import root, times
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.pairs import Coordinates, Pair, cleaned
-from ..xla.programs import FAST, QUICK, Program, traced
+from ..xla.programs import Program, is_traced
+from ..xla.settings import COMPILE_FAST, RUN_FAST
 from .results import RESULTS, is_usable
 
 
@@ -121,9 +122,9 @@ class Orientation(eqx.Module):
         """The corrections v of (x_left, y_left, x_right, y_right) of the oriented pair,
         zero where masked."""
         data = self.pose, pair
-        if traced(data):
+        if is_traced(data):
             return _corrections_of(data)
-        settings = FAST if jnp.ndim(self.sigma0) else QUICK
+        settings = RUN_FAST if jnp.ndim(self.sigma0) else COMPILE_FAST
         return Program(_corrections_of, {}, settings)(data)
 
     def check(self) -> "Orientation":

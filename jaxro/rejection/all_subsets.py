@@ -15,7 +15,7 @@ from ..geometry.linear import Linear, linearised
 from ..geometry.pairs import Pair, cleaned
 from ..orientation.orient import orient
 from ..orientation.starts import AbstractStart, Vertical
-from ..xla.reductions import count, total
+from ..xla.passes import count, total
 from .base import (
     OUTCOMES,
     AbstractProcedure,

@@ -23,8 +23,8 @@ from ..geometry.pairs import Pair
 from ..orientation.orient import orient
 from ..orientation.result import Orientation
 from ..orientation.results import is_usable
-from ..xla.programs import while_loop
-from ..xla.reductions import count, total
+from ..xla.kernels import while_loop
+from ..xla.passes import count, total
 
 PointValues = Float[Array, "*pairs point"]
 

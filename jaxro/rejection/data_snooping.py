@@ -11,7 +11,7 @@ from ..geometry.linear import linearised
 from ..geometry.pairs import Pair, cleaned
 from ..orientation.orient import orient
 from ..orientation.starts import AbstractStart, Vertical
-from ..xla.reductions import count
+from ..xla.passes import count
 from .base import (
     AbstractProcedure,
     Rejection,

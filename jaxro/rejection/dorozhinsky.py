@@ -14,8 +14,8 @@ import jax.numpy as jnp
 
 from ..geometry.elements import AbstractElements
 from ..geometry.pairs import Pair, cleaned
-from ..xla.programs import while_loop
-from ..xla.reductions import count
+from ..xla.kernels import while_loop
+from ..xla.passes import count
 from .base import (
     OUTCOMES,
     AbstractProcedure,

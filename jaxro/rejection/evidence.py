@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
-from ..xla.reductions import count, total
+from ..xla.passes import count, total
 from .hypotheses import moved_up, squares
 
 Values = Float[Array, "point"]

@@ -8,8 +8,8 @@ from jaxtyping import Array, Bool, Float
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearised
 from ..geometry.pairs import Pair
-from ..xla.programs import if_needed
-from ..xla.reductions import count, total
+from ..xla.kernels import if_needed
+from ..xla.passes import count, total
 from .hypotheses import squares
 from .robust import stepped
 

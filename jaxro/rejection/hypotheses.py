@@ -21,8 +21,8 @@ from ..orientation.starts.decomposition import best_pose
 from ..orientation.starts.eight_point import eight_point
 from ..orientation.starts.five_point import five_point
 from ..orientation.starts.general import vectors
-from ..xla.programs import stage
-from ..xla.reductions import count
+from ..xla.kernels import computed_once
+from ..xla.passes import count
 
 Poses = tuple[RelativePose, Bool[Array, "..."]]
 """Orientations on a leading axis, and which of them exist."""
@@ -154,7 +154,7 @@ def refined(
         ]
 
     def step(_, pose: RelativePose):
-        *n, (*h, _) = stage(normal)(stage(rows)(pose))
+        *n, (*h, _) = computed_once(normal)(computed_once(rows)(pose))
         return pose.moved(tuple(-d for d in solve(n, h)))
 
     pose = lax.fori_loop(0, steps, step, jax.tree.map(single, pose))

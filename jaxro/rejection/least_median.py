@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from ..geometry.elements import RelativePose, vertical
 from ..geometry.pairs import Pair, cleaned
-from ..xla.reductions import count, total
+from ..xla.passes import count, total
 from .base import Rejection
 from .hypotheses import (
     AbstractHypotheses,

@@ -12,8 +12,8 @@ from ..geometry.elements import AbstractElements
 from ..geometry.mock_pairs import noisy, planted
 from ..geometry.pairs import Pair, cleaned
 from ..orientation.orient import orient
-from ..xla.programs import stage
-from ..xla.reductions import count, sums, total
+from ..xla.kernels import computed_once
+from ..xla.passes import count, sums, total
 from .base import (
     AbstractProcedure,
     PointValues,
@@ -88,7 +88,7 @@ def closed_form(
         factor = jnp.where(testable, q / jnp.where(testable, redundancy, 1.0), 0.0)
         return q, a, [factor * column for column in z], testable
 
-    q, a, change, testable = stage(shared)(pair, mask, elements)
+    q, a, change, testable = computed_once(shared)(pair, mask, elements)
 
     def one(own, *change):
         moved = q + sum(column * c for column, c in zip(a, change, strict=True))

@@ -34,7 +34,7 @@ import numpy as np
 from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float
 
-from ..xla.reductions import count, sums, total
+from ..xla.passes import count, sums, total
 
 PARAMETERS = 5
 """Elements of a relative orientation."""

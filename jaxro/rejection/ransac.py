@@ -12,8 +12,8 @@ from ..adjustment import critical_values
 from ..geometry.elements import RelativePose, vertical
 from ..geometry.linear import linearised
 from ..geometry.pairs import Pair, cleaned
-from ..xla.programs import while_loop
-from ..xla.reductions import count, total
+from ..xla.kernels import while_loop
+from ..xla.passes import count, total
 from .base import Rejection
 from .hypotheses import (
     AbstractHypotheses,

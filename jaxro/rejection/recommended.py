@@ -26,8 +26,8 @@ from ..assessment.undecided import undecided
 from ..geometry.elements import RelativePose, vertical
 from ..geometry.linear import linearised
 from ..geometry.pairs import Pair, cleaned
-from ..xla.programs import if_needed
-from ..xla.reductions import count, total
+from ..xla.kernels import if_needed
+from ..xla.passes import count, total
 from . import evidence
 from .base import OUTCOMES, AbstractProcedure, Rejection
 from .fading import faded

@@ -11,8 +11,8 @@ from ..geometry.elements import RelativePose
 from ..geometry.linear import linearised
 from ..geometry.pairs import Pair, cleaned
 from ..orientation.starts import AbstractStart, Vertical
-from ..xla.programs import while_loop
-from ..xla.reductions import count
+from ..xla.kernels import while_loop
+from ..xla.passes import count
 from .base import OUTCOMES, Rejection
 from .robust import AbstractSearch, Values, judged, normalised, scaled, stepped
 

@@ -15,8 +15,8 @@ from ..geometry.elements import RelativePose
 from ..geometry.linear import Linear, linearised
 from ..geometry.pairs import Pair
 from ..orientation.orient import orient
-from ..xla.programs import while_loop
-from ..xla.reductions import count, total
+from ..xla.kernels import while_loop
+from ..xla.passes import count, total
 from .base import (
     OUTCOMES,
     AbstractProcedure,

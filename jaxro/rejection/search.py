@@ -34,8 +34,8 @@ from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearised
 from ..geometry.pairs import Pair
-from ..xla.programs import while_loop
-from ..xla.reductions import count, total
+from ..xla.kernels import while_loop
+from ..xla.passes import count, total
 from . import five_points
 from .hypotheses import moved_up, squares, subsets
 from .robust import seen, stepped

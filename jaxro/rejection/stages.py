@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from ..geometry.elements import RelativePose, vertical
 from ..geometry.pairs import Pair
 from ..orientation import planes
-from ..xla.reductions import count, total
+from ..xla.passes import count, total
 from . import evidence
 from .hypotheses import squares
 from .robust import agreeing, improved, one_by_one, seen

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, cleaned
 from ..orientation import planes
-from ..xla.programs import if_needed, while_loop
-from ..xla.reductions import count, total
+from ..xla.kernels import if_needed, while_loop
+from ..xla.passes import count, total
 from . import evidence
 from .graduated_non_convexity import GraduatedNonConvexity
 from .hypotheses import Newton, squares

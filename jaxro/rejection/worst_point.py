@@ -4,7 +4,7 @@ again."""
 import jax.numpy as jnp
 
 from ..geometry.pairs import Pair, cleaned
-from ..xla.reductions import count
+from ..xla.passes import count
 from .base import (
     OUTCOMES,
     AbstractProcedure,

@@ -24,7 +24,7 @@ from ..geometry.elements import (
 from ..geometry.pairs import Pair
 from ..orientation.result import Orientation
 from ..orientation.results import RESULTS
-from ..xla.reductions import count
+from ..xla.passes import count
 from .files import POINTS, RESIDUALS, head
 from .solutions import Units, element_names, element_values, given, unit_of
 

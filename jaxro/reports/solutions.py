@@ -26,7 +26,8 @@ from ..geometry.pairs import Camera, Coordinates, Pair, cleaned
 from ..orientation.result import Orientation
 from ..orientation.results import RESULTS
 from ..tables.csv import Measurements
-from ..xla.programs import FAST, QUICK, Program
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST, RUN_FAST
 
 NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
 """Names of the results by their number."""
@@ -100,9 +101,9 @@ def read(
     # one program: the command line loads it in each of its calls
     return Solved(
         orientation,
-        *Program(_told if one else _all_told, options, QUICK if one else FAST)(
-            (pair, orientation)
-        ),
+        *Program(
+            _told if one else _all_told, options, COMPILE_FAST if one else RUN_FAST
+        )((pair, orientation)),
     )
 
 

@@ -29,7 +29,7 @@ from ..adjustment import JointAdjustment, Term, adjust, critical_values as criti
 from ..adjustment.guarded import root
 from ..adjustment.results import RESULTS
 from ..assessment.reliability import UNTESTABLE
-from ..xla.reductions import total
+from ..xla.passes import total
 
 Places = Sequence[int] | np.ndarray | Array
 Flags = Sequence[bool] | np.ndarray | Array

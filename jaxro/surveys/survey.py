@@ -24,8 +24,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ..adjustment import critical_values as critical
 from ..adjustment.guarded import root
 from ..assessment.propagation import jacobian, propagate_each
-from ..xla.programs import QUICK, Program, traced
-from ..xla.reductions import total
+from ..xla.passes import total
+from ..xla.programs import Program, is_traced
+from ..xla.settings import COMPILE_FAST
 from .heights import Number, Sight, Square, Station, sighted
 from .levelling import Flags, Levelled, Network, Places, adjust_heights, network
 
@@ -230,9 +231,9 @@ def heights(
 def solve(survey: Survey, *, level: float = 0.001, power: float = 0.80) -> Surveyed:
     """Heights with their standard deviations, and the tests of the traverses. Works
     under jit and vmap."""
-    if traced(survey):
+    if is_traced(survey):
         return _solved(survey, level=level, power=power)
-    return Program(_solved, {"level": level, "power": power}, QUICK)(survey)
+    return Program(_solved, {"level": level, "power": power}, COMPILE_FAST)(survey)
 
 
 def _solved(survey: Survey, level: float, power: float) -> Surveyed:

@@ -23,7 +23,7 @@ from typing import Any
 import jax
 from jaxtyping import PyTree
 
-MOST = 40
+MAX_PROGRAMS = 40
 """Programs kept, of about 1 MB each; the oldest go."""
 
 _folder: Path | None = None
@@ -33,10 +33,10 @@ def use(folder: Path | None) -> None:
     """Keep compiled programs in this folder from now on (None: nowhere), unless
     somebody else could write to it."""
     global _folder
-    _folder = folder if folder is not None and _ours(folder) else None
+    _folder = folder if folder is not None and _is_ours(folder) else None
 
 
-def _ours(folder: Path) -> bool:
+def _is_ours(folder: Path) -> bool:
     try:
         there = folder.stat()
     except OSError:
@@ -64,7 +64,7 @@ def active() -> bool:
     return _folder is not None
 
 
-def compiled(
+def load_or_compile(
     function: Callable, settings: dict[str, Any] | None, data: PyTree, key: PyTree
 ) -> Callable:
     """jit(function) for data of these shapes, from the folder if it is there, else
@@ -75,7 +75,9 @@ def compiled(
     leaves, structure = jax.tree.flatten(data)
     shapes = [(a.shape, str(a.dtype)) for a in map(jax.typeof, leaves)]
     try:
-        content = _in_full((_surroundings(), settings, shapes, str(structure), key))
+        content = _pickle_in_full(
+            (_list_surroundings(), settings, shapes, str(structure), key)
+        )
     except (
         pickle.PicklingError,
         AttributeError,
@@ -114,7 +116,7 @@ def compiled(
     )
 
 
-def _in_full(value: Any) -> bytes:
+def _pickle_in_full(value: Any) -> bytes:
     """The pickle of a value without references to objects that occur in it before, so
     that equal values have equal ones whichever objects they are made of."""
     file = io.BytesIO()
@@ -153,14 +155,14 @@ def _write(path: Path, content: bytes) -> None:
             key=lambda file: file.stat().st_mtime,
             reverse=True,
         )
-        for old in newest_first[MOST:]:
+        for old in newest_first[MAX_PROGRAMS:]:
             old.unlink(missing_ok=True)
     except OSError:
         return
 
 
 @lru_cache
-def _surroundings() -> tuple:
+def _list_surroundings() -> tuple:
     """What every program depends on."""
     source = hashlib.sha256()
     for file in sorted(Path(__file__).parents[1].rglob("*.py")):

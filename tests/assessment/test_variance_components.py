@@ -12,7 +12,7 @@ import pytest
 from jaxro import IndependentElements, orient, pad
 from jaxro.assessment import variance_components as components
 from jaxro.geometry import mock_pairs
-from jaxro.xla.programs import QUICK, known
+from jaxro.xla.settings import COMPILE_FAST, known_settings
 
 optimize = pytest.importorskip("scipy.optimize")
 
@@ -36,7 +36,8 @@ def program():
         )
 
     return jax.jit(
-        jax.vmap(one, in_axes=(None, None, 0, None)), compiler_options=known(QUICK)
+        jax.vmap(one, in_axes=(None, None, 0, None)),
+        compiler_options=known_settings(COMPILE_FAST),
     )
 
 

@@ -21,17 +21,11 @@ from jaxro.geometry import mock_pairs
 from jaxro.geometry.elements import vertical
 from jaxro.orientation import starts
 from jaxro.xla import slabs, store
-from jaxro.xla.memory import LARGE, PIECES, Memory
-from jaxro.xla.pointwise import pointwise
-from jaxro.xla.programs import (
-    FAST,
-    ONE_KERNEL,
-    UNDIVIDED,
-    Program,
-    known,
-    whole,
-    whole_of_many,
-)
+from jaxro.xla.kernels import one_kernel, one_kernel_fusing_points
+from jaxro.xla.passes import pointwise
+from jaxro.xla.programs import Program
+from jaxro.xla.settings import NO_LIBRARY_SUMS, RUN_FAST, UNSPLIT_LOOPS, known_settings
+from jaxro.xla.slabs import LARGE, PIECES, Memory
 
 
 def mixed(count=150, points=9):
@@ -185,12 +179,12 @@ def test_only_what_is_selected_and_progress(pairs):
     ] == 150
 
 
-@pytest.mark.parametrize("kernel", [whole, whole_of_many])
+@pytest.mark.parametrize("kernel", [one_kernel, one_kernel_fusing_points])
 def test_one_kernel_gives_what_many_give(pairs, kernel):
     options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
     few = jax.tree.map(lambda a: a[:96], pairs)
     programs = [
-        Program(batch._slab_near, options, FAST | UNDIVIDED, kernel=kernel)
+        Program(batch._slab_near, options, RUN_FAST | UNSPLIT_LOOPS, kernel=kernel)
         for kernel in (kernel, None)
     ]
     (one, fits), (many, again) = (
@@ -227,8 +221,8 @@ def test_results_of_points_are_one_loop_each(pairs):
     host = jax.tree.map(np.asarray, pairs)
     options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
     run = jax.jit(
-        lambda data: whole_of_many(batch._slab_near)(data, **options),
-        compiler_options=known(FAST | UNDIVIDED | ONE_KERNEL),
+        lambda data: one_kernel_fusing_points(batch._slab_near)(data, **options),
+        compiler_options=known_settings(RUN_FAST | UNSPLIT_LOOPS | NO_LIBRARY_SUMS),
     )
     compiled = run.lower(jax.tree.map(lambda a: a[:96], host)).compile().as_text()
     results, arguments = zip(
@@ -258,9 +252,12 @@ def test_points_in_one_loop_are_points_one_by_one():
     for function in (of, slope):
         one, many = (
             Program(
-                lambda data, function=function: function(data), {}, FAST, kernel=kernel
+                lambda data, function=function: function(data),
+                {},
+                RUN_FAST,
+                kernel=kernel,
             )((x, use, jnp.asarray(3.0)))
-            for kernel in (whole_of_many, None)
+            for kernel in (one_kernel_fusing_points, None)
         )
         for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
             np.testing.assert_array_equal(a, b)
@@ -355,17 +352,17 @@ def test_slabs_are_shared_and_an_end_is_one_for_all():
     for threads in (1, 2, 5):
         run = Doubled()
         np.testing.assert_array_equal(
-            slabs.spread(data, run, slabs.Way(threads, slab=1), 1), 2 * data
+            slabs.spread(data, run, slabs.Split(threads, slab=1), 1), 2 * data
         )
         assert sorted(run.began) == data.tolist()
         for bad in (0, 1, 2, 10):
             run = Doubled(bad)
             with pytest.raises(OSError, match="no more"):
-                slabs.spread(data, run, slabs.Way(threads, slab=1), 1)
+                slabs.spread(data, run, slabs.Split(threads, slab=1), 1)
             assert len(run.began) < 100
         run = Doubled()
         with pytest.raises(KeyboardInterrupt):
-            slabs.spread(data, run, slabs.Way(threads, slab=1), 1, _interrupted)
+            slabs.spread(data, run, slabs.Split(threads, slab=1), 1, _interrupted)
         assert len(run.began) < 100
 
 
@@ -381,7 +378,7 @@ def test_a_slab_is_stored_before_the_next_is_calculated():
             return np.zeros(1, int)
 
     run = Doubled(becomes=Calculating())
-    slabs.spread(np.arange(10), run, slabs.Way(1, slab=1), 1)
+    slabs.spread(np.arange(10), run, slabs.Split(1, slab=1), 1)
     assert seen == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
 
 
@@ -399,8 +396,8 @@ def test_memory_that_a_program_still_reads_is_not_used_again():
     )
     rows, size = 3 << 14, 1 << 16
     expected = program(np.concatenate([np.ones(rows), np.zeros(size - rows)]))
-    found = program(slabs._filled(np.ones(rows), size))  # goes on in another thread
-    slabs._filled(np.full(rows, 7.0), size)
+    found = program(slabs._fill_up(np.ones(rows), size))  # goes on in another thread
+    slabs._fill_up(np.full(rows, 7.0), size)
     np.testing.assert_array_equal(found, expected)
 
 

@@ -13,17 +13,18 @@ import pytest
 import jaxro
 from jaxro.geometry import mock_pairs
 from jaxro.xla import programs
-from jaxro.xla.programs import FAST, Program, prompt
+from jaxro.xla.programs import Program, jit_in_this_thread
+from jaxro.xla.settings import RUN_FAST
 
 
 @pytest.fixture
 def unkept():
     folder = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
-    programs._compiled.cache_clear()
+    programs._compile.cache_clear()
     yield
     jax.config.update("jax_compilation_cache_dir", folder)
-    programs._compiled.cache_clear()
+    programs._compile.cache_clear()
 
 
 def long(x):
@@ -34,7 +35,7 @@ def long(x):
 
 def test_a_program_has_run_when_its_call_returns(unkept):
     x = jnp.linspace(0.0, 1.0, 3000)
-    for run in (prompt(long), lambda x: Program(long, {}, FAST)(x)):
+    for run in (jit_in_this_thread(long), lambda x: Program(long, {}, RUN_FAST)(x)):
         jax.block_until_ready(run(x))
         assert run(x).is_ready()
 
@@ -44,7 +45,7 @@ def test_a_program_has_run_when_its_call_returns(unkept):
 )
 def test_whatever_the_first_number(unkept, first):
     x = np.array([first, 1.0, 2.0])
-    np.testing.assert_array_equal(prompt(lambda x: (-x, x[:0]))(x)[0], -x)
+    np.testing.assert_array_equal(jit_in_this_thread(lambda x: (-x, x[:0]))(x)[0], -x)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +53,9 @@ def test_whatever_the_first_number(unkept, first):
     [np.zeros((0, 2)), np.arange(3), np.array([True, False]), np.float32([1, 2])],
 )
 def test_arrays_of_any_kind(unkept, data):
-    np.testing.assert_array_equal(prompt(lambda x: x[::-1])(data), data[::-1])
+    np.testing.assert_array_equal(
+        jit_in_this_thread(lambda x: x[::-1])(data), data[::-1]
+    )
 
 
 def test_batches_from_two_threads_at_once_are_those_of_kept_programs(request):

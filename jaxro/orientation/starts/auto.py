@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool
 
 from ...geometry.elements import RelativePose
 from ...geometry.pairs import Pair
-from ...xla.programs import while_loop
+from ...xla.kernels import while_loop
 from ..inspection import Inspection, inspect
 from .base import AbstractStart, StartingPose, approached
 from .general import General

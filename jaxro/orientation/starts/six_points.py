@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ...geometry.elements import IndependentElements, to_pose
 from ...geometry.pairs import Pair
-from ...xla.reductions import total
+from ...xla.passes import total
 from .base import AbstractStart, StartingPose
 
 Scalar = Float[Array, ""] | float
