@@ -98,7 +98,7 @@ class Database:
     ) -> TableError:
         """What is wrong, and where."""
         place = ", ".join([str(self.file), f"table {table}", *([row] if row else [])])
-        return TableError(place, None, column, found, expected)
+        return TableError(place, column=column, found=found, expected=expected)
 
     def _rows(
         self, table: str, columns: tuple[str, ...], order: str
@@ -267,7 +267,7 @@ def opened(file: Path, out: Path | None, force: bool) -> Iterator[Database]:
     the block ends without an error; after one nothing is changed. Raises TableError."""
     if not file.is_file():
         raise TableError(
-            file, None, None, "no such file", "a COLMAP database; check the path"
+            file, found="no such file", expected="a COLMAP database; check the path"
         )
     if out is not None and out.absolute() == file.absolute():
         out = None
@@ -334,15 +334,15 @@ def _said(file: Path, written: Path | None = None) -> Iterator[None]:
             "a database that nothing else writes to, in a folder that can be written; "
             "or --out for a copy"
         )
-        raise TableError(written or file, None, None, str(error), expected) from None
+        raise TableError(written or file, found=str(error), expected=expected) from None
     except sqlite3.DatabaseError as error:
         raise TableError(
-            file, None, None, str(error), "a sound SQLite database made by COLMAP"
+            file, found=str(error), expected="a sound SQLite database made by COLMAP"
         ) from None
     except OSError as error:
         found = error.strerror or str(error)
         raise TableError(
-            written or file, None, None, found, "a file that can be written"
+            written or file, found=found, expected="a file that can be written"
         ) from None
 
 

@@ -90,7 +90,7 @@ def named(name: str) -> AbstractProcedure:
     """The procedure of this name. Raises TableError."""
     if name not in PROCEDURES:
         raise TableError(
-            "--procedure", None, None, repr(name), f"one of {', '.join(PROCEDURES)}"
+            "--procedure", found=repr(name), expected=f"one of {', '.join(PROCEDURES)}"
         )
     return PROCEDURES[name]
 

@@ -95,10 +95,8 @@ def on_ray(job: Job, told: Callable[[int], None]) -> Iterator[dict[str, Any]]:
         )
         raise TableError(
             job.work.file,
-            None,
-            None,
-            found,
-            f"{expected}; what is finished --resume keeps",
+            found=found,
+            expected=f"{expected}; what is finished --resume keeps",
         ) from None
 
 
@@ -116,5 +114,5 @@ def _check_address(address: str | None) -> None:
             "this machine"
         )
         raise TableError(
-            "RAY_ADDRESS", None, None, f"{address}: {error}", expected
+            "RAY_ADDRESS", found=f"{address}: {error}", expected=expected
         ) from None

@@ -106,7 +106,7 @@ def orient_database(
     Raises TableError."""
     if not (np.isfinite(options.sigma) and options.sigma > 0):
         raise TableError(
-            "--sigma", None, None, repr(options.sigma), "a positive number of pixels"
+            "--sigma", found=repr(options.sigma), expected="a positive number of pixels"
         )
     begin, summary = time.perf_counter(), Summary()
     with opened(options.database, options.out, options.force) as database:

@@ -77,10 +77,8 @@ def prepared(options: Options) -> Named:
             if value is not None:
                 raise TableError(
                     name,
-                    None,
-                    None,
-                    "it without READINGS.csv",
-                    "the readings that it belongs to",
+                    found="it without READINGS.csv",
+                    expected="the readings that it belongs to",
                 )
         name = example.NAME
         texts = (
@@ -97,10 +95,8 @@ def prepared(options: Options) -> Named:
     if options.grid is None:
         raise TableError(
             "--grid",
-            None,
-            None,
-            "no table of the grid",
-            "--grid GRID.csv with square,side,photo_side",
+            found="no table of the grid",
+            expected="--grid GRID.csv with square,side,photo_side",
         )
     camera_height, base = (
         positive(name, value)
@@ -125,7 +121,7 @@ def positive(option: str, value: float | None) -> float:
     """The value. Raises TableError unless it is a length."""
     if value is None or not in_bounds(value):
         found = "no value" if value is None else repr(value)
-        raise TableError(option, None, None, found, "a positive length in mm")
+        raise TableError(option, found=found, expected="a positive length in mm")
     return value
 
 
@@ -153,18 +149,14 @@ def deviations_of(given: list[str]) -> Deviations:
             )
             raise TableError(
                 "--sd",
-                None,
-                None,
-                repr(text),
-                f"NAME=VALUE in mm, of which the defaults are {defaults}",
+                found=repr(text),
+                expected=f"NAME=VALUE in mm, of which the defaults are {defaults}",
             )
         if names[name] in values:
             raise TableError(
                 "--sd",
-                None,
-                None,
-                f"{name} a second time",
-                "each standard deviation once",
+                found=f"{name} a second time",
+                expected="each standard deviation once",
             )
         values[names[name]] = value
     return Deviations(**values)

@@ -120,10 +120,8 @@ def prepared(
         missing = "FILE" if options.file is None else "--out"
         raise TableError(
             missing,
-            None,
-            None,
-            "nothing",
-            "a table and --out DIR where results are Parquet tables",
+            found="nothing",
+            expected="a table and --out DIR where results are Parquet tables",
         )
     chosen = tuple(
         name.strip()
@@ -132,7 +130,7 @@ def prepared(
     for name in chosen:
         if name not in TABLES:
             raise TableError(
-                "--tables", None, None, repr(name), f"some of {','.join(TABLES)}"
+                "--tables", found=repr(name), expected=f"some of {','.join(TABLES)}"
             )
     whole.check_name(options.out, "a name for the folder of results")
     out = options.out.resolve()
@@ -170,7 +168,7 @@ def _refused(
     expected = (
         f"a table that can be read and a folder {folder} that can be written{more}"
     )
-    return TableError(file, None, None, found, expected)
+    return TableError(file, found=found, expected=expected)
 
 
 def _planned(
@@ -266,7 +264,11 @@ def _check_cameras(
                 check_one_sigma(str(table.path), None, *both)
         except TableError as error:
             raise TableError(
-                error.file, table.place(row), error.column, error.found, error.expected
+                error.file,
+                line=table.place(row),
+                column=error.column,
+                found=error.found,
+                expected=error.expected,
             ) from None
 
 
@@ -280,14 +282,12 @@ def _check(options: Options, out: Path, folder: Path, resume: bool) -> None:
     if resume and not folder.exists():
         raise TableError(
             folder,
-            None,
-            None,
-            "no such folder",
-            "the --out of a run that was stopped, to resume it",
+            found="no such folder",
+            expected="the --out of a run that was stopped, to resume it",
         )
     if folder.exists() and not resume and not options.force:
         expected = "--resume to go on, or --force to begin anew"
-        raise TableError(folder, None, None, "a run that was stopped", expected)
+        raise TableError(folder, found="a run that was stopped", expected=expected)
 
 
 def _check_place(
@@ -310,10 +310,8 @@ def _check_place(
         )
         raise TableError(
             folder,
-            None,
-            None,
-            found,
-            "another --out: Parquet results take the place of the whole folder",
+            found=found,
+            expected="another --out: Parquet results take the place of the whole folder",
         )
 
 

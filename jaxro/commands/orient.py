@@ -285,10 +285,8 @@ def read_cameras(options: Options, otherwise: Example) -> camera_files.Cameras:
             if value is not None:
                 raise TableError(
                     name,
-                    None,
-                    None,
-                    "it beside --camera",
-                    f"this entry in {options.camera} instead",
+                    found="it beside --camera",
+                    expected=f"this entry in {options.camera} instead",
                 )
         return camera_files.read(options.camera)
     focal = (
@@ -302,14 +300,16 @@ def read_cameras(options: Options, otherwise: Example) -> camera_files.Cameras:
             "camera.toml"
         )
         raise TableError(
-            "--focal", None, None, "neither --focal nor --camera", expected
+            "--focal", found="neither --focal nor --camera", expected=expected
         )
     for name, value in (("--focal", focal), ("--pixel-size", options.pixel_size)):
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise TableError(name, None, None, repr(value), "a positive number")
+            raise TableError(name, found=repr(value), expected="a positive number")
     centre = options.principal_point or (0.0, 0.0)
     if not all(map(math.isfinite, centre)):
-        raise TableError("--principal-point", None, None, repr(centre), "two numbers")
+        raise TableError(
+            "--principal-point", found=repr(centre), expected="two numbers"
+        )
     pixel_size = 1.0 if options.pixel_size is None else options.pixel_size
     one = Camera(focal, centre, pixel_size, options.y_down)
     return camera_files.Cameras("--focal", one, one)
@@ -322,27 +322,21 @@ def check_numbers(
     if not options.unit.strip() or any(mark in options.unit for mark in "[]\n"):
         raise TableError(
             "--unit",
-            None,
-            None,
-            repr(options.unit),
-            "a name such as mm or px, without brackets",
+            found=repr(options.unit),
+            expected="a name such as mm or px, without brackets",
         )
     if options.confidence is not None and not 0 < options.confidence < 1:
         raise TableError(
             "--confidence",
-            None,
-            None,
-            repr(options.confidence),
-            "a probability such as 0.95",
+            found=repr(options.confidence),
+            expected="a probability such as 0.95",
         )
     if options.sigma is not None:
         if has_sigma:
             raise TableError(
                 "--sigma",
-                None,
-                None,
-                f"it beside the column sigma of {file}",
-                "only one of the two",
+                found=f"it beside the column sigma of {file}",
+                expected="only one of the two",
             )
         deviation.stated(options.sigma)
     if options.base is not None:
@@ -352,7 +346,7 @@ def check_numbers(
                 "the base 1"
             )
             raise TableError(
-                "--base", None, None, "it with relative elements", expected
+                "--base", found="it with relative elements", expected=expected
             )
         if (
             not math.isfinite(options.base)
@@ -364,7 +358,7 @@ def check_numbers(
                 if system is IndependentElements
                 else "a number other than 0"
             )
-            raise TableError("--base", None, None, repr(options.base), allowed)
+            raise TableError("--base", found=repr(options.base), expected=allowed)
 
 
 def orient_all(job: Job, progress: Callable[[int], None]) -> list[Solved]:

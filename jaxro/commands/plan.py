@@ -102,22 +102,20 @@ def planned(options: Options) -> tuple[Plan, Deviations]:
             "at most a quarter of the camera height, "
             f"{planning.LARGEST_BASE * camera_height:g}"
         )
-        raise TableError("--base", None, None, f"{base:g}", expected)
+        raise TableError("--base", found=f"{base:g}", expected=expected)
     for name, value in (("--depth", options.depth), ("--step", options.step)):
         if not 0 <= value < camera_height:
             raise TableError(
                 name,
-                None,
-                None,
-                repr(value),
-                "a length in mm, less than the camera height",
+                found=repr(value),
+                expected="a length in mm, less than the camera height",
             )
     for name, count in (("--legs", options.legs), ("--traverses", options.traverses)):
         if count < 1:
-            raise TableError(name, None, None, repr(count), "1 or more")
+            raise TableError(name, found=repr(count), expected="1 or more")
     if options.of not in QUANTITIES:
         raise TableError(
-            "--of", None, None, repr(options.of), f"one of {', '.join(QUANTITIES)}"
+            "--of", found=repr(options.of), expected=f"one of {', '.join(QUANTITIES)}"
         )
     if options.want is not None:
         positive("--want", options.want)
@@ -192,10 +190,8 @@ def _needed(
         )
         raise TableError(
             "--want",
-            None,
-            None,
-            f"{what}, which no base and no camera height gives",
-            expected,
+            found=f"{what}, which no base and no camera height gives",
+            expected=expected,
         )
     lines = [f"For {what}:"]
     if base <= (shortest := planning.SHORTEST_BASE * options.camera_height) * (

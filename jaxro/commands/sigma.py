@@ -28,10 +28,10 @@ def stated(sigma: Sigma) -> float | None:
         expected = (
             f"a standard deviation such as 0.005, or {AUTO}: that of the residuals"
         )
-        raise TableError("--sigma", None, None, repr(sigma), expected) from None
+        raise TableError("--sigma", found=repr(sigma), expected=expected) from None
     if not (math.isfinite(value) and value > 0):
         raise TableError(
-            "--sigma", None, None, repr(value), "a positive standard deviation"
+            "--sigma", found=repr(value), expected="a positive standard deviation"
         )
     return value
 
@@ -44,7 +44,7 @@ def from_residuals(pairs: list[Pair] | Ragged) -> TableNoise:
     except ValueError as error:
         expected = "the standard deviation of a coordinate itself, --sigma SD"
         raise TableError(
-            "--sigma", None, None, f"{AUTO}, but {error}", expected
+            "--sigma", found=f"{AUTO}, but {error}", expected=expected
         ) from None
 
 

@@ -49,17 +49,15 @@ def reproduce(name: str, trials: int | None, seed: int | None) -> bool:
     """Calculate and show an experiment of a paper. Raises TableError."""
     if name not in REPRODUCTIONS:
         raise TableError(
-            "NAME", None, None, repr(name), f"one of {', '.join(REPRODUCTIONS)}"
+            "NAME", found=repr(name), expected=f"one of {', '.join(REPRODUCTIONS)}"
         )
     experiment = REPRODUCTIONS[name]
     for option, value in (("--trials", trials), ("--seed", seed)):
         if value is not None and not experiment.random:
             raise TableError(
                 option,
-                None,
-                None,
-                f"it with {name}",
-                "no such option: nothing is random there",
+                found=f"it with {name}",
+                expected="no such option: nothing is random there",
             )
     _check_trials(trials)
     console, errors = consoles()
@@ -81,10 +79,8 @@ def run_comparison(options: Options, wanted: Wanted) -> bool:
     if not 0 <= wanted.false_alarms < 1:
         raise TableError(
             "--false-alarms",
-            None,
-            None,
-            repr(wanted.false_alarms),
-            "a share: 0, or less than 1",
+            found=repr(wanted.false_alarms),
+            expected="a share: 0, or less than 1",
         )
     if wanted.out is not None:
         whole.check_file(wanted.out, wanted.force)
@@ -96,7 +92,7 @@ def run_comparison(options: Options, wanted: Wanted) -> bool:
             f"at most {most - LEAST} of {most} points, so that {LEAST} good ones are "
             "left"
         )
-        raise TableError("--errors", None, None, str(max(errors)), expected)
+        raise TableError("--errors", found=str(max(errors)), expected=expected)
     with progress(warnings, "Comparing", None) as told:
         found = compare(
             layouts,
@@ -129,19 +125,16 @@ def layouts_of(options: Options, warnings: Any) -> dict[str, Pair]:
         advice = ADVICE[NAMES[int(solved.result._value)]]
         raise TableError(
             job.table.file,
-            measured.lines[0],
-            None,
-            f"pair {measured.name!r}: {advice}",
-            "usable elements",
+            line=measured.lines[0],
+            found=f"pair {measured.name!r}: {advice}",
+            expected="usable elements",
         )
     sigma = pair.sigma if job.sigma_known else pair.sigma * solved.sigma0
     if not float(jnp.max(sigma)) > 0:
         raise TableError(
             "--sigma",
-            None,
-            None,
-            "none, and no sigma0 from the pair",
-            "the standard deviation to simulate",
+            found="none, and no sigma0 from the pair",
+            expected="the standard deviation to simulate",
         )
     x_left, y_left, x_right, y_right = solved.corrections(pair)
     exact = mock_pairs.planted(
@@ -171,7 +164,9 @@ def _standard(options: Options) -> dict[str, Pair]:
     ):
         if value is not None:
             raise TableError(
-                name, None, None, "it without FILE.csv", "the table that it belongs to"
+                name,
+                found="it without FILE.csv",
+                expected="the table that it belongs to",
             )
     given = deviation.stated(options.sigma)
     sigma = SIGMA if given is None else given
@@ -244,10 +239,10 @@ def _numbers(option: str, text: str, kind: Callable[[str], T]) -> list[T]:
             if kind is int
             else "positive numbers such as 8,10,15"
         )
-        raise TableError(option, None, None, repr(text), expected)
+        raise TableError(option, found=repr(text), expected=expected)
     return list(dict.fromkeys(values))
 
 
 def _check_trials(trials: int | None) -> None:
     if trials is not None and trials < 1:
-        raise TableError("--trials", None, None, repr(trials), "1 or more")
+        raise TableError("--trials", found=repr(trials), expected="1 or more")

@@ -253,7 +253,7 @@ class Job:
         except OSError as error:
             found = error.strerror or str(error)
             raise TableError(
-                self.work.folder, None, None, found, "a folder that can be written"
+                self.work.folder, found=found, expected="a folder that can be written"
             ) from None
 
     def go_on(self) -> None:
@@ -269,7 +269,10 @@ class Job:
                     f"{self.request.get(key)!r} now"
                 )
                 raise TableError(
-                    path, 1, None, found, "the same table and options, or a new --out"
+                    path,
+                    line=1,
+                    found=found,
+                    expected="the same table and options, or a new --out",
                 )
         self.entries = [entry for entry in lines[1:] if self._stands(entry)]
         self._rewritten()  # without a line that was cut off
@@ -353,10 +356,8 @@ def _whole_lines(path: Path) -> Iterator[dict[str, Any]]:
     except OSError:
         raise TableError(
             path,
-            None,
-            None,
-            "no journal",
-            "the --out of a run that was stopped, to resume it",
+            found="no journal",
+            expected="the --out of a run that was stopped, to resume it",
         ) from None
     for line in text.splitlines(keepends=True):
         try:

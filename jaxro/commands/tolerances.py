@@ -62,7 +62,7 @@ def changed(procedure: AbstractProcedure, changes: list[str]) -> AbstractProcedu
             if len(named) > 1:
                 found += f", which may be {' or '.join(named)}"
             raise TableError(
-                "--tolerance", None, None, found, f"NAME=VALUE with one of: {listed}"
+                "--tolerance", found=found, expected=f"NAME=VALUE with one of: {listed}"
             )
         procedure = _with(procedure, named[0], text)
     return procedure
@@ -90,7 +90,7 @@ def check_sigma(name: str, procedure: AbstractProcedure, known: bool) -> None:
             "column sigma in the table"
         )
         raise TableError(
-            "--sigma", None, None, "neither --sigma nor a column sigma", expected
+            "--sigma", found="neither --sigma nor a column sigma", expected=expected
         )
 
 
@@ -125,7 +125,9 @@ def _value(name: str, kind: type | None, text: str) -> Number:
     if kind is bool:
         if text.lower() in ("true", "false"):
             return text.lower() == "true"
-        raise TableError("--tolerance", None, None, f"{name}={text}", "true or false")
+        raise TableError(
+            "--tolerance", found=f"{name}={text}", expected="true or false"
+        )
     least, most = (0, 1) if name in PROBABILITIES else (0, math.inf)
     try:
         value = int(text) if kind is int else float(text)
@@ -141,7 +143,7 @@ def _value(name: str, kind: type | None, text: str) -> Number:
             else "not negative"
         )
         raise TableError(
-            "--tolerance", None, None, f"{name}={text}", f"{kinds}, {size}"
+            "--tolerance", found=f"{name}={text}", expected=f"{kinds}, {size}"
         )
     return value
 

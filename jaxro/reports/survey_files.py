@@ -98,7 +98,7 @@ def finished(named: Named) -> Done:
             "size"
         )
         raise TableError(
-            "traverses", None, None, "a network without a solution", expected
+            "traverses", found="a network without a solution", expected=expected
         )
     one = jax.tree.map(np.asarray, named.survey)
     levelled, support, origin = set(one.levelled.tolist()), one.support, []

@@ -58,7 +58,9 @@ class Cameras:
                 f"LEFT-RIGHT or LEFT_RIGHT with two photos of {self.file}: "
                 f"{', '.join(self.photos)}"
             )
-            raise TableError(file, line, "pair", found, expected)
+            raise TableError(
+                file, line=line, column="pair", found=found, expected=expected
+            )
         return self.photos[known[0][0]], self.photos[known[0][1]]
 
     def of_all(
@@ -80,7 +82,10 @@ def read(path: Path) -> Cameras:
         line = re.search(r"at line (\d+)", str(error))
         where = int(line[1]) if line else None
         raise TableError(
-            path, where, None, f"no valid TOML ({error})", f"the tables {FORMS}"
+            path,
+            line=where,
+            found=f"no valid TOML ({error})",
+            expected=f"the tables {FORMS}",
         ) from None
     names = set(tables)
     if names == {"photo"} and isinstance(tables["photo"], dict) and tables["photo"]:
@@ -100,7 +105,7 @@ def read(path: Path) -> Cameras:
         )
         return Cameras(str(path), left, right)
     found = f"the entries {', '.join(tables)}" if tables else "no entries"
-    raise TableError(path, None, None, found, FORMS)
+    raise TableError(path, found=found, expected=FORMS)
 
 
 def _camera(path: Path, text: str, table: str, entries: Any) -> Camera:
@@ -109,31 +114,32 @@ def _camera(path: Path, text: str, table: str, entries: Any) -> Camera:
     if not isinstance(entries, dict):
         raise TableError(
             path,
-            None,
-            table,
-            repr(entries),
-            f"a table [{table}] with {', '.join(KEYS)}",
+            column=table,
+            found=repr(entries),
+            expected=f"a table [{table}] with {', '.join(KEYS)}",
         )
     for key, value in entries.items():
         line, place = _line(text, table, key), f"{table}.{key}"
         if key not in KEYS:
             raise TableError(
                 path,
-                line,
-                place,
-                "an unknown key",
-                f"{', '.join(KEYS)}; none is ignored",
+                line=line,
+                column=place,
+                found="an unknown key",
+                expected=f"{', '.join(KEYS)}; none is ignored",
             )
         good, expected = _fits(key, value)
         if not good:
-            raise TableError(path, line, place, repr(value), expected)
+            raise TableError(
+                path, line=line, column=place, found=repr(value), expected=expected
+            )
     if "focal" not in entries:
         raise TableError(
             path,
-            _line(text, table),
-            f"{table}.focal",
-            "no such key",
-            "the focal length in photo units",
+            line=_line(text, table),
+            column=f"{table}.focal",
+            found="no such key",
+            expected="the focal length in photo units",
         )
     x0, y0 = entries.get("principal_point", (0, 0))
     return Camera(
@@ -187,7 +193,9 @@ def check_one_sigma(
             "coordinates in photo units where the pixel sizes differ, so that one "
             "sigma serves both photos"
         )
-        raise TableError(file, line, "sigma", found, expected)
+        raise TableError(
+            file, line=line, column="sigma", found=found, expected=expected
+        )
 
 
 def to_pair(

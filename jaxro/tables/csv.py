@@ -83,10 +83,10 @@ def parse(text: str, file: str, name: str) -> Table:
             found = f"{point!r} a second time in pair {pair!r} (first on line {first})"
             raise TableError(
                 file,
-                line,
-                "point",
-                found,
-                "each point once in a pair; rename it or delete one of the two",
+                line=line,
+                column="point",
+                found=found,
+                expected="each point once in a pair; rename it or delete one of the two",
             )
         twin = places.setdefault((pair, *values[:4]), point)
         if twin != point:
@@ -108,10 +108,9 @@ def no_points(file: str, line: int) -> TableError:
     """There is nothing below this line."""
     return TableError(
         file,
-        line + 1,
-        None,
-        "no points",
-        "one line for every measured point below the header",
+        line=line + 1,
+        found="no points",
+        expected="one line for every measured point below the header",
     )
 
 
@@ -162,9 +161,9 @@ def _number(text: str, file: str, line: int, column: str) -> float:
     if column == "sigma" and value <= 0:
         raise TableError(
             file,
-            line,
-            column,
-            repr(text),
-            "a positive standard deviation in the unit of the coordinates",
+            line=line,
+            column=column,
+            found=repr(text),
+            expected="a positive standard deviation in the unit of the coordinates",
         )
     return value

@@ -15,18 +15,14 @@ class TableError(ValueError):
     def __init__(
         self,
         file: str | Path,
-        line: int | str | None,
-        column: str | None,
+        *,
         found: str,
         expected: str,
+        line: int | str | None = None,
+        column: str | None = None,
     ):
-        self.file, self.line, self.column, self.found, self.expected = (
-            str(file),
-            line,
-            column,
-            found,
-            expected,
-        )
+        self.file, self.line, self.column = str(file), line, column
+        self.found, self.expected = found, expected
         place = [self.file]
         if line is not None:
             place.append(line if isinstance(line, str) else f"line {line}")
@@ -58,7 +54,9 @@ class Columns:
         """The place of every column by its full name. Raises TableError."""
         if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
             expected = "fields separated by commas, decimals by points"
-            raise TableError(file, line, None, f"the header {header[0]!r}", expected)
+            raise TableError(
+                file, line=line, found=f"the header {header[0]!r}", expected=expected
+            )
         places: dict[str, int] = {}
         for place, entry in enumerate(header):
             given, full = entry.strip().lower(), self.full(entry)
@@ -70,20 +68,30 @@ class Columns:
                 )
                 raise TableError(
                     file,
-                    line,
-                    given or None,
-                    what,
-                    f"{self}; delete or rename it, none is ignored",
+                    line=line,
+                    column=given or None,
+                    found=what,
+                    expected=f"{self}; delete or rename it, none is ignored",
                 )
             if full in places:
                 found = "this column a second time"
                 raise TableError(
-                    file, line, given, found, "each column once; delete one of the two"
+                    file,
+                    line=line,
+                    column=given,
+                    found=found,
+                    expected="each column once; delete one of the two",
                 )
             places[full] = place
         for name in self.required:
             if name not in places:
-                raise TableError(file, line, name, "no such column", str(self))
+                raise TableError(
+                    file,
+                    line=line,
+                    column=name,
+                    found="no such column",
+                    expected=str(self),
+                )
         return places
 
 
@@ -96,10 +104,8 @@ def read_text(path: Path) -> str:
         expected = "a readable file; check the path and its permissions"
         raise TableError(
             path,
-            None,
-            None,
-            f"no file that can be read ({error.strerror or error})",
-            expected,
+            found=f"no file that can be read ({error.strerror or error})",
+            expected=expected,
         ) from None
     try:
         return data.decode("utf-8-sig")
@@ -107,7 +113,10 @@ def read_text(path: Path) -> str:
         line = data.count(b"\n", 0, error.start) + 1
         found = f"the byte 0x{data[error.start]:02x}"
         raise TableError(
-            path, line, None, found, "UTF-8 text; save the table as CSV UTF-8"
+            path,
+            line=line,
+            found=found,
+            expected="UTF-8 text; save the table as CSV UTF-8",
         ) from None
 
 
@@ -120,7 +129,10 @@ def lines_of(
     line, header = next(rows, (1, None))
     if header is None:
         raise TableError(
-            file, 1, None, "no text at all", f"a header line with {columns}"
+            file,
+            line=1,
+            found="no text at all",
+            expected=f"a header line with {columns}",
         )
     places = columns.places(header, file, line)
     for line, row in rows:
@@ -128,17 +140,19 @@ def lines_of(
             missing = next(name for name, place in places.items() if place == len(row))
             raise TableError(
                 file,
-                line,
-                missing,
-                f"{len(row)} fields",
-                f"{len(places)}, as in the header",
+                line=line,
+                column=missing,
+                found=f"{len(row)} fields",
+                expected=f"{len(places)}, as in the header",
             )
         if len(row) > len(places):
             expected = (
                 f"{len(places)}, as in the header; decimals are written with a point, "
                 "names with commas in quotes"
             )
-            raise TableError(file, line, None, f"{len(row)} fields", expected)
+            raise TableError(
+                file, line=line, found=f"{len(row)} fields", expected=expected
+            )
         yield line, {name: row[place].strip() for name, place in places.items()}
 
 
@@ -146,7 +160,11 @@ def name(text: str, file: str, line: int, column: str) -> str:
     """A name. Raises TableError if it is empty."""
     if not text:
         raise TableError(
-            file, line, column, "an empty field", f"the name of the {column}"
+            file,
+            line=line,
+            column=column,
+            found="an empty field",
+            expected=f"the name of the {column}",
         )
     return text
 
@@ -162,13 +180,19 @@ def number(text: str, file: str, line: int, column: str, advice: str = "") -> fl
     ):  # Python reads 1_0 as 10; a measuring table does not
         raise TableError(
             file,
-            line,
-            column,
-            repr(text) if text else "an empty field",
-            f"a number such as -12.345{advice}",
+            line=line,
+            column=column,
+            found=repr(text) if text else "an empty field",
+            expected=f"a number such as -12.345{advice}",
         )
     if not math.isfinite(value):
-        raise TableError(file, line, column, repr(text), f"a finite number{advice}")
+        raise TableError(
+            file,
+            line=line,
+            column=column,
+            found=repr(text),
+            expected=f"a finite number{advice}",
+        )
     return value
 
 
@@ -183,7 +207,7 @@ def _rows(text: Iterable[str], file: str) -> Iterator[tuple[int, list[str]]]:
         except csv.Error as error:
             expected = "comma-separated fields, each quotation closed on its line"
             raise TableError(
-                file, reader.line_num, None, str(error), expected
+                file, line=reader.line_num, found=str(error), expected=expected
             ) from None
         if any(entry.strip() for entry in row):
             yield reader.line_num, row

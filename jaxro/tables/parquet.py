@@ -58,7 +58,7 @@ class Source:
         except (OSError, pa.ArrowInvalid) as error:
             found = f"no Parquet file that can be read ({str(error).splitlines()[0]})"
             raise TableError(
-                path, None, None, found, "a Parquet table of measured points"
+                path, found=found, expected="a Parquet table of measured points"
             ) from None
         self.columns = _columns(path, self._file.schema_arrow)
         self._position, self._batches = -1, iter(())
@@ -79,7 +79,9 @@ class Source:
         a pair comes in two parts."""
         if not self.count:
             raise TableError(
-                self.path, None, None, "no points", "one row for every measured point"
+                self.path,
+                found="no points",
+                expected="one row for every measured point",
             )
         for name in NAMES:
             self._complete(name)
@@ -121,10 +123,9 @@ class Source:
                 row += int(np.flatnonzero(blank.to_numpy(zero_copy_only=False))[0])
                 raise TableError(
                     self.path,
-                    None,
-                    full,
-                    f"nothing in {self.place(row)}",
-                    f"the name of the {full}",
+                    column=full,
+                    found=f"nothing in {self.place(row)}",
+                    expected=f"the name of the {full}",
                 )
             row += len(blank)
 
@@ -139,10 +140,9 @@ class Source:
                 )
                 raise TableError(
                     self.path,
-                    None,
-                    "pair",
-                    found,
-                    "the rows of a pair one behind the other: sort the table",
+                    column="pair",
+                    found=found,
+                    expected="the rows of a pair one behind the other: sort the table",
                 )
             seen.add(name)
 
@@ -216,7 +216,10 @@ def _columns(path: Path, schema: Any) -> dict[str, str]:
         if not good:
             expected = "text or whole numbers" if named else "numbers"
             raise TableError(
-                path, None, field.name, f"values of type {field.type}", expected
+                path,
+                column=field.name,
+                found=f"values of type {field.type}",
+                expected=expected,
             )
     return {full: schema.names[place] for full, place in places.items()}
 

@@ -71,10 +71,9 @@ def rows(text: str, file: str, columns: Columns) -> list[Row]:
     if not found:
         raise TableError(
             file,
-            line + 1,
-            None,
-            "no lines",
-            f"{columns}, and one line for each below them",
+            line=line + 1,
+            found="no lines",
+            expected=f"{columns}, and one line for each below them",
         )
     return found
 
@@ -86,9 +85,21 @@ def _cell(entry: str, file: str, line: int, column: str, optional: bool) -> Any:
         return None
     value = fields.number(entry, file, line, column)
     if column in POSITIVE and value <= 0:
-        raise TableError(file, line, column, repr(entry), "a positive length in mm")
+        raise TableError(
+            file,
+            line=line,
+            column=column,
+            found=repr(entry),
+            expected="a positive length in mm",
+        )
     if abs(value) > LONGEST:
-        raise TableError(file, line, column, repr(entry), f"mm, at most {LONGEST:g}")
+        raise TableError(
+            file,
+            line=line,
+            column=column,
+            found=repr(entry),
+            expected=f"mm, at most {LONGEST:g}",
+        )
     return value
 
 
@@ -118,7 +129,11 @@ def assembled(
                 "a name that no square has: a square's name is that of its corner"
             )
             raise TableError(
-                readings[0], readings[1][number].line, "point", repr(name), expected
+                readings[0],
+                line=readings[1][number].line,
+                column="point",
+                found=repr(name),
+                expected=expected,
             )
     _check_scale(*grid, camera_height)
     side, photo_side = (np.array([row.cells[c] for row in grid[1]]) for c in POSITIVE)
@@ -129,7 +144,11 @@ def assembled(
         name = row.cells["square"]
         if name not in squares:
             raise TableError(
-                readings[0], row.line, "square", repr(name), f"a square of {grid[0]}"
+                readings[0],
+                line=row.line,
+                column="square",
+                found=repr(name),
+                expected=f"a square of {grid[0]}",
             )
         k = squares[name]
         own, there = row.cells.get("grid"), grid[1][k].cells.get("parallax")
@@ -139,7 +158,11 @@ def assembled(
                 f"{name!r} in {grid[0]}"
             )
             raise TableError(
-                readings[0], row.line, "grid", "no reading of the grid", expected
+                readings[0],
+                line=row.line,
+                column="grid",
+                found="no reading of the grid",
+                expected=expected,
             )
         square.append(k)
         at_grid.add(
@@ -157,7 +180,11 @@ def assembled(
                 f"{camera_height:g}"
             )
             raise TableError(
-                readings[0], row.line, "height", repr(known_height), expected
+                readings[0],
+                line=row.line,
+                column="height",
+                found=repr(known_height),
+                expected=expected,
             )
     height = [row.cells.get("height") for row in readings[1]]
     names, count = list(points), len(points)
@@ -172,7 +199,13 @@ def assembled(
                         "corner"
                     )
                     file = traverses[0]  # pyright: ignore[reportOptionalSubscript]
-                    raise TableError(file, row.line, column, repr(name), expected)
+                    raise TableError(
+                        file,
+                        line=row.line,
+                        column=column,
+                        found=repr(name),
+                        expected=expected,
+                    )
                 points[name] = len(names)
                 names.append(name)
                 corner = squares[name]
@@ -274,10 +307,10 @@ def _numbered(file: str, table: list[Row], column: str) -> dict[str, int]:
             )
             raise TableError(
                 file,
-                row.line,
-                column,
-                found,
-                f"each {column} once; of repeated readings give the mean",
+                line=row.line,
+                column=column,
+                found=found,
+                expected=f"each {column} once; of repeated readings give the mean",
             )
         numbers[name] = len(numbers)
     return numbers
@@ -293,7 +326,13 @@ def _check_scale(file: str, grid: list[Row], camera_height: float) -> None:
                 f"less than the camera height of {camera_height:g}, which counts from "
                 "the same zero"
             )
-            raise TableError(file, row.line, "height", repr(datum), expected)
+            raise TableError(
+                file,
+                line=row.line,
+                column="height",
+                found=repr(datum),
+                expected=expected,
+            )
         focal.append(
             row.cells["photo_side"] / row.cells["side"] * (camera_height - datum)
         )
@@ -303,10 +342,10 @@ def _check_scale(file: str, grid: list[Row], camera_height: float) -> None:
             found = f"{row.cells['photo_side']!r}, so a focal length of {one:.4g} mm"
             raise TableError(
                 file,
-                row.line,
-                "photo_side",
-                found,
-                f"that of the other squares, {usual:.4g} mm",
+                line=row.line,
+                column="photo_side",
+                found=found,
+                expected=f"that of the other squares, {usual:.4g} mm",
             )
     if not FOCAL[0] < usual < FOCAL[1]:
         found = f"squares of a photo with a focal length of {usual:.4g} mm"
@@ -314,7 +353,7 @@ def _check_scale(file: str, grid: list[Row], camera_height: float) -> None:
             "side, photo_side, --camera-height all in mm, heights and --camera-height "
             "from one zero"
         )
-        raise TableError(file, None, "photo_side", found, expected)
+        raise TableError(file, column="photo_side", found=found, expected=expected)
 
 
 def _check_reading(
@@ -326,10 +365,10 @@ def _check_reading(
     if reading == 0 and abs(dp) > p_c / 2:
         raise TableError(
             file,
-            row.line,
-            column,
-            "a reading of 0",
-            "the reading of the point; delete the line without",
+            line=row.line,
+            column=column,
+            found="a reading of 0",
+            expected="the reading of the point; delete the line without",
         )
     if p_c + dp <= 0:
         found = (
@@ -346,10 +385,10 @@ def _check_reading(
         return
     raise TableError(
         file,
-        row.line,
-        column,
-        found,
-        "a reading in mm, from the same zero as those of the grid",
+        line=row.line,
+        column=column,
+        found=found,
+        expected="a reading in mm, from the same zero as those of the grid",
     )
 
 
@@ -363,10 +402,10 @@ def _check_legs(
         if a == b:
             raise TableError(
                 file,
-                row.line,
-                "to",
-                repr(names[b]),
-                "another point than the leg comes from",
+                line=row.line,
+                column="to",
+                found=repr(names[b]),
+                expected="another point than the leg comes from",
             )
         name = row.cells["traverse"]
         if last.get(name, names[a]) != names[a]:
@@ -374,7 +413,9 @@ def _check_legs(
                 repr(names[a]),
                 f"{last[name]!r}, where the leg before it of traverse {name!r} ends",
             )
-            raise TableError(file, row.line, "from", found, expected)
+            raise TableError(
+                file, line=row.line, column="from", found=found, expected=expected
+            )
         last[name] = names[b]
     used = np.unique([start, end])
     lost = set(
@@ -389,16 +430,15 @@ def _check_legs(
             found = f"{names[a]!r}, which no legs join to a known height"
             raise TableError(
                 file,
-                row.line,
-                "from",
-                found,
-                "a corner of the grid, or a point with a known height",
+                line=row.line,
+                column="from",
+                found=found,
+                expected="a corner of the grid, or a point with a known height",
             )
     if known[used].all():
         raise TableError(
             file,
-            legs[0].line,
-            None,
-            "legs between known heights alone",
-            "points whose heights are sought",
+            line=legs[0].line,
+            found="legs between known heights alone",
+            expected="points whose heights are sought",
         )

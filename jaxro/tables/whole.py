@@ -19,15 +19,13 @@ def check_target(directory: Path, force: bool) -> None:
     check_name(directory, "a name for the folder of results")
     if directory.exists() and not directory.is_dir():
         raise TableError(
-            directory, None, None, "a file", "the name of a folder for the results"
+            directory, found="a file", expected="the name of a folder for the results"
         )
     if not force and directory.exists() and any(directory.iterdir()):
         raise TableError(
             directory,
-            None,
-            None,
-            "a folder that is not empty",
-            "a new folder, or --force to overwrite",
+            found="a folder that is not empty",
+            expected="a new folder, or --force to overwrite",
         )
 
 
@@ -36,15 +34,13 @@ def check_file(path: Path, force: bool) -> None:
     check_name(path, "a name for the file of the result")
     if path.is_dir():
         raise TableError(
-            path, None, None, "a folder", "the name of a file for the result"
+            path, found="a folder", expected="the name of a file for the result"
         )
     if not force and path.exists():
         raise TableError(
             path,
-            None,
-            None,
-            "a file that exists",
-            "a new name, or --force to overwrite",
+            found="a file that exists",
+            expected="a new name, or --force to overwrite",
         )
 
 
@@ -53,14 +49,14 @@ def check_name(path: Path, expected: str) -> None:
     it."""
     whole = path.resolve()
     if not whole.name:
-        raise TableError(path, None, None, "the root of all folders", expected)
+        raise TableError(path, found="the root of all folders", expected=expected)
     try:
         whole.with_name(f".{whole.name}.{os.getpid()}.unfinished.old").lstat()
     except FileNotFoundError:
         pass
     except OSError as error:
         raise TableError(
-            path, None, None, error.strerror or str(error), expected
+            path, found=error.strerror or str(error), expected=expected
         ) from None
 
 
@@ -79,10 +75,8 @@ def write(
         ]:
             raise TableError(
                 file,
-                None,
-                None,
-                "a table to be read where a result is to be written",
-                "another --out",
+                found="a table to be read where a result is to be written",
+                expected="another --out",
             )
     draft = directory.absolute().with_name(
         f".{directory.absolute().name}.{os.getpid()}.partial"
@@ -101,10 +95,8 @@ def write(
     except OSError as error:
         raise TableError(
             directory,
-            None,
-            None,
-            error.strerror or str(error),
-            "a folder that can be written",
+            found=error.strerror or str(error),
+            expected="a folder that can be written",
         ) from None
     finally:
         shutil.rmtree(draft, ignore_errors=True)
@@ -119,7 +111,9 @@ def write_file(path: Path, text: str) -> None:
         os.replace(draft, path)
     except OSError as error:
         raise TableError(
-            path, None, None, error.strerror or str(error), "a file that can be written"
+            path,
+            found=error.strerror or str(error),
+            expected="a file that can be written",
         ) from None
     finally:
         with suppress(OSError):
