@@ -1,5 +1,5 @@
-"""Runs the suites and prints, writes or holds against the committed table what they
-measured."""
+"""Run the benchmark suites; print what they measured, keep it, or compare it with the
+committed figures."""
 
 import argparse
 import datetime
@@ -8,7 +8,8 @@ import os
 import platform
 import sys
 
-from . import metrics as contract
+from . import summary
+from .metrics import Baseline, Metric, read_baseline, table, write_baseline
 
 
 def machine() -> str:
@@ -49,50 +50,51 @@ def main() -> int:
     parser.add_argument(
         "--update-baseline",
         action="store_true",
-        help="put the table into benchmarks/results.md",
+        help="write benchmarks/baseline.json and the page results.md made of it",
     )
     parser.add_argument(
         "--gate",
         action="store_true",
-        help="fail where a ratio is worse than the committed one allows",
+        help="fail where a figure (times left out) is worse than the tolerance around "
+        "that of baseline.json",
     )
     options = parser.parse_args()
     if options.update_baseline and (options.only or options.quick):
         parser.error(
-            "--update-baseline takes a whole run: the table's figures stand beside "
-            "each other"
+            "--update-baseline needs a full run: its figures are compared with each "
+            "other"
         )
 
     measured = []
     for name in options.only or suites:
         found = suites[name](QUICK if options.quick else Size())
-        print(
-            name,
-            *(metric.row() for metric in found),
-            sep="\n",
-            file=sys.stderr,
-            flush=True,
-        )  # a run takes minutes
+        rows = [metric.row() for metric in found]
+        # a run takes long: show what there is
+        print(name, *rows, sep="\n", file=sys.stderr, flush=True)
         measured += found
-    print(f"{machine()}\n\n{contract.table(measured)}")
+    print(f"{machine()}\n\n{table(measured)}")
 
-    worse = []
-    if options.gate:
-        before = contract.committed()
-        worse = [
-            m
-            for m in measured
-            if m.key in before
-            and not (m.of_the_machine or m.held_against(before[m.key]))
-        ]
-        for metric in worse:
-            print(
-                f"worse: {metric.key}: {metric.value:.4g} {metric.unit}, committed "
-                f"{before[metric.key]:.4g}"
-            )
+    worse = _worse(measured) if options.gate else []
+    for line in worse:
+        print(line)
     if options.update_baseline:
-        contract.write(measured, machine())
+        baseline = Baseline(machine(), [], measured)
+        write_baseline(baseline)
+        summary.write_page(read_baseline())
     return 1 if worse else 0
+
+
+def _worse(measured: list[Metric]) -> list[str]:
+    """A line for each figure that is worse than the committed one allows. Times are not
+    compared: they depend on the machine."""
+    committed = read_baseline().values()
+    return [
+        f"worse: {metric.key}: {metric.value:.4g} {metric.unit}, committed "
+        f"{committed[metric.key]:.4g}"
+        for metric in measured
+        if metric.key in committed
+        and not (metric.is_time or metric.holds(committed[metric.key]))
+    ]
 
 
 if __name__ == "__main__":

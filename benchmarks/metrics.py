@@ -1,16 +1,15 @@
-"""A benchmark is a contract: what was measured, what is promised, how far it may
-slip."""
+"""One measured figure, what is promised of it, and how far it may slip; and the
+committed figures of the last full run."""
 
-import re
+import json
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
-RESULTS = Path(__file__).with_name("results.md")
-START, END = "<!-- measured -->", "<!-- end of measured -->"
+BASELINE = Path(__file__).with_name("baseline.json")
 
 
 @dataclass(frozen=True)
@@ -26,9 +25,14 @@ class Metric:
     goal: float | None = None
 
     @property
-    def of_the_machine(self) -> bool:
+    def is_time(self) -> bool:
         """Whether it is a time, which says nothing on another machine."""
         return self.unit.split()[0] in ("s", "ms", "µs", "ns")
+
+    @property
+    def missed(self) -> bool:
+        """Whether it has a goal and does not reach it."""
+        return self.goal is not None and not self.reaches(self.goal)
 
     def reaches(self, bound: float) -> bool:
         """Whether the value is at least as good as `bound`."""
@@ -36,27 +40,38 @@ class Metric:
             self.value >= bound if self.direction == "higher" else self.value <= bound
         )
 
-    def held_against(self, committed: float) -> bool:
+    def holds(self, committed: float) -> bool:
         """Whether the value is within the tolerance of the committed one."""
         slack = 1 - self.tolerance if self.direction == "higher" else 1 + self.tolerance
         return self.reaches(committed * slack)
 
+    @property
+    def goal_text(self) -> str:
+        """The goal as a bound: ">= 8"; empty without a goal."""
+        if self.goal is None:
+            return ""
+        return f"{'>=' if self.direction == 'higher' else '<='} {self.goal:.3g}"
+
     def row(self) -> str:
-        """The line of the results table."""
-        goal = (
-            ""
-            if self.goal is None
-            else f"{'>=' if self.direction == 'higher' else '<='} {self.goal:g}"
-        )
-        verdict = (
-            ""
-            if self.goal is None
-            else ("yes" if self.reaches(self.goal) else "**no**")
-        )
+        """The line of a Markdown table."""
+        reached = "" if self.goal is None else "**no**" if self.missed else "yes"
         return (
             f"| {self.key} | {self.value:.4g} | {self.unit} | {self.direction} | "
-            f"{goal} | {verdict} |"
+            f"{self.goal_text} | {reached} |"
         )
+
+
+class Baseline(NamedTuple):
+    """A full run: the machine in a line, remarks that hold for this run only, and all
+    figures."""
+
+    machine: str
+    remarks: list[str]
+    metrics: list[Metric]
+
+    def values(self) -> dict[str, float]:
+        """The value of each figure by its key."""
+        return {metric.key: metric.value for metric in self.metrics}
 
 
 def table(metrics: Iterable[Metric]) -> str:
@@ -67,23 +82,47 @@ def table(metrics: Iterable[Metric]) -> str:
     return "\n".join([head, *(metric.row() for metric in metrics)])
 
 
-def committed() -> dict[str, float]:
-    """key -> value of the table in results.md."""
-    text = RESULTS.read_text() if RESULTS.exists() else ""
-    rows = re.findall(
-        r"^\| (.+?) \| (\S+) \|",
-        text.partition(START)[2].partition(END)[0],
-        re.MULTILINE,
-    )
-    return {key: float(value) for key, value in rows if key not in ("metric", "---")}
+def read_baseline() -> Baseline:
+    """The figures of baseline.json. Tolerances are not among them: those of the code
+    hold."""
+    content = json.loads(BASELINE.read_text(encoding="utf-8"))
+    metrics = [
+        Metric(
+            key,
+            entry["value"],
+            entry["unit"],
+            entry["better"],
+            goal=entry.get("goal"),
+        )
+        for key, entry in content["metrics"].items()
+    ]
+    return Baseline(content["machine"], content["remarks"], metrics)
 
 
-def write(metrics: Iterable[Metric], machine: str) -> None:
-    """Puts the table between the markers of results.md; the text around them stays."""
-    before, _, rest = RESULTS.read_text().partition(START)
-    RESULTS.write_text(
-        f"{before}{START}\n{machine}\n\n{table(metrics)}\n{END}{rest.partition(END)[2]}"
+def write_baseline(baseline: Baseline) -> None:
+    """Write baseline.json, one figure a line, so that a change of one figure changes
+    one line."""
+    lines = ",\n".join(
+        f"    {_json(metric.key)}: {_json(_entry(metric))}"
+        for metric in baseline.metrics
     )
+    remarks = json.dumps(baseline.remarks, ensure_ascii=False, indent=2)
+    remarks = remarks.replace("\n", "\n  ")
+    BASELINE.write_text(
+        f'{{\n  "machine": {_json(baseline.machine)},\n  "remarks": {remarks},\n'
+        f'  "metrics": {{\n{lines}\n  }}\n}}\n',
+        encoding="utf-8",
+    )
+
+
+def _entry(metric: Metric) -> dict[str, Any]:
+    goal = {} if metric.goal is None else {"goal": metric.goal}
+    value = float(f"{metric.value:.4g}")
+    return {"value": value, "unit": metric.unit, "better": metric.direction} | goal
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
 
 
 def median_seconds(
