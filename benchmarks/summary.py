@@ -75,7 +75,7 @@ def _split(metric: Metric) -> Row:
         workload, _, figure = metric.key.partition(", ")
     what, who = figure, ""
     if _section(metric) == "answers" and ", " in figure:
-        what, _, who = figure.rpartition(", ")
+        what, _, who = figure.partition(", ")
     unit = "" if metric.unit in ("times", "of 1", "a pair") else f" {metric.unit}"
     text = f"{metric.value:.3g}{unit}"
     if metric.goal is not None:
