@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 import jaxro
 from jaxro.batches import ragged
-from jaxro.batches.padding import planned
+from jaxro.batches.padding import plan_for
 from jaxro.tables import parquet
 
 from .common import Size, pair_of, rate
@@ -178,7 +178,7 @@ def lengths(size: Size) -> list[Metric]:
         *(np.ones(one[0].size, t) for t in (float, bool)),
         *focals,
     )
-    plan = planned(np.tile(drawn, 64), 64)  # as of a part of a long table
+    plan = plan_for(np.tile(drawn, 64), 64)  # as of a part of a long table
     calls = {
         "uneven": partial(ragged.orient_ragged, uneven, plan=plan),
         "even": partial(ragged.orient_ragged, even),

@@ -54,7 +54,7 @@ def table_1(points: int) -> Pair:
     flat = mock_pairs.mock_pair(
         mock_pairs.standard_layout(points), focal=70.0, base=70.0, y_range=70.0
     )
-    return mock_pairs.planted(flat, y_right=TABLE_1_ERRORS[:points])
+    return mock_pairs.plant(flat, y_right=TABLE_1_ERRORS[:points])
 
 
 table_2 = dorozhinsky1971.table_2

@@ -56,11 +56,11 @@ def move(family: Any, steps: Float[Array, "member d"]) -> Any:
 
 def normalise(family: Any) -> Any:
     """All members of a family in their standard form."""
-    return jax.vmap(lambda block: as_given(as_parameters(block).normalised()))(family)
+    return jax.vmap(lambda block: as_given(as_parameters(block).normalise()))(family)
 
 
 def _move(block: Any, step: Float[Array, " d"]) -> Any:
-    return as_given(as_parameters(block).moved(step))
+    return as_given(as_parameters(block).move(step))
 
 
 def residuals(term: Term, families: Families, steps: Steps) -> Float[Array, "group m"]:

@@ -67,9 +67,8 @@ def chi_squared(level: ArrayLike, freedom: ArrayLike) -> Scalar:
     """A sum of `freedom` squared normal numbers exceeds it with probability `level`."""
     level, freedom = jnp.asarray(level, float), jnp.asarray(freedom, float)
     x = -jnp.log(jnp.clip(level, 1e-300, 1.0))
-    most = (
-        freedom + 2 * jnp.sqrt(freedom * x) + 2 * x + 1
-    )  # it exceeds this less often (Laurent and Massart 2000)
+    # it exceeds this less often (Laurent and Massart 2000)
+    most = freedom + 2 * jnp.sqrt(freedom * x) + 2 * x + 1
     return _where(
         lambda x: gammaincc(freedom / 2, x / 2) > level, most, increasing=False
     )

@@ -348,9 +348,8 @@ def redundancies(
     for name, member, a in own:
         taken = taken + product(a, cofactors(layout, solution, name)[member], a)
         assert solution.eliminated is not None
-        crossed = (
-            solution.eliminated.by_kept @ solution.cofactor
-        )  # of eliminated with kept parameters, times -1
+        # of eliminated with kept parameters, times -1
+        crossed = solution.eliminated.by_kept @ solution.cofactor
         rows = jnp.arange(layout[name].size)[None, :, None]
         for other, of_other, b in kept:
             q = crossed[

@@ -99,7 +99,7 @@ class Joint(eqx.Module):
     ) -> Solution:
         """The solution of the normal equations with the weights of a loss."""
         normals = elimination.accumulate(
-            self.layout, self.terms, [_weighted(part, loss) for part in parts]
+            self.layout, self.terms, [_weight(part, loss) for part in parts]
         )
         return elimination.solve(normals, self._constraint(steps))
 
@@ -201,7 +201,7 @@ def _read(
         cofactor=solution.cofactor,
         residuals=tuple(part.residuals for part in parts),
         redundancy=tuple(
-            elimination.redundancies(layout, weighted, term, _weighted(part, loss))
+            elimination.redundancies(layout, weighted, term, _weight(part, loss))
             for term, part in zip(terms, parts, strict=True)
         ),
         sigma0=jnp.where(checked, sigma0, jnp.nan),
@@ -214,7 +214,7 @@ def _read(
     )
 
 
-def _weighted(part: Linearised, loss: AbstractLoss | None) -> Linearised:
+def _weight(part: Linearised, loss: AbstractLoss | None) -> Linearised:
     """Residuals and columns times the roots of the weights rho'(r²)."""
     if loss is None:
         return part

@@ -103,10 +103,10 @@ def adjust(
         )
     if as_parameters(start).count > normal.UNROLLED:
         return _adjust_as_block(terms[0], start, **how)
-    return _adjust_unrolled(terms[0], start, **how)
+    return _adjust_few(terms[0], start, **how)
 
 
-def _adjust_unrolled(
+def _adjust_few(
     term: Term,
     start: PyTree,
     *,
@@ -125,7 +125,7 @@ def _adjust_unrolled(
         residuals, origin, solver, max_steps
     )
     solution = kernel_part(solve)(origin, residuals)
-    solved = start.moved(solution.value).normalised()
+    solved = start.move(solution.value).normalise()
     converged = solution.result == optx.RESULTS.successful
     at_solution = Residuals(residuals.term, solved)
     return read(at_solution, loss, solution.stats["num_steps"], converged)

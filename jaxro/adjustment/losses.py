@@ -71,9 +71,8 @@ class SoftL1(AbstractLoss):
     scale: float = 1.0
 
     def rho(self, s):
-        return (
-            2 * s / (1 + jnp.sqrt(1 + s / self.scale**2))
-        )  # without a difference of nearly equal numbers
+        # without a difference of nearly equal numbers
+        return 2 * s / (1 + jnp.sqrt(1 + s / self.scale**2))
 
 
 class Cauchy(AbstractLoss):

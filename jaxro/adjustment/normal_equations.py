@@ -114,9 +114,8 @@ def directional(function: Callable, at: tuple, direction: tuple) -> tuple[Any, A
 
     watched.defjvp(seen, symbolic_zeros=True)
     value, slope = jax.jvp(flat, at, direction)
-    moving = [
-        None if zero else s for zero, s in zip(still, slope, strict=False)
-    ]  # those that move come after
+    # those that move come after
+    moving = [None if zero else s for zero, s in zip(still, slope, strict=False)]
     return jax.tree.unflatten(structure[0], value), jax.tree.unflatten(
         structure[0], moving
     )
@@ -269,9 +268,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
             jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)),
             1.0,
         )
-        rounding = (previous > 0) & (
-            ratio >= 1
-        )  # a first step tells nothing of how they fall
+        # a first step tells nothing of how they fall
+        rounding = (previous > 0) & (ratio >= 1)
         predicted = size * jnp.where(rounding, min(1.0, self.atol / ROUNDING), ratio)
         return moved, (predicted, size), None
 

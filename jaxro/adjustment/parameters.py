@@ -30,10 +30,10 @@ class AbstractParameters(eqx.Module):
         """The number of local parameters."""
 
     @abc.abstractmethod
-    def moved(self, step: Step | Float[Array, " count"]) -> "AbstractParameters":
+    def move(self, step: Step | Float[Array, " count"]) -> "AbstractParameters":
         """The parameters after a small step."""
 
-    def normalised(self) -> "AbstractParameters":
+    def normalise(self) -> "AbstractParameters":
         """The same parameters in their standard form."""
         return self
 
@@ -44,7 +44,7 @@ class AbstractParameters(eqx.Module):
     def slopes(self, function: Callable, x: Step) -> tuple[Any, list[Any]]:
         """function(*arguments) of the parameters moved by x, and its derivatives along
         `count` directions there."""
-        return slopes(lambda *x: function(*self.moved(x).arguments()), x)
+        return slopes(lambda *x: function(*self.move(x).arguments()), x)
 
     def further(self, x: Step, step: Step) -> Step:
         """The displacement x followed by a step along the directions of `slopes`."""
@@ -60,7 +60,7 @@ class Numbers(AbstractParameters):
     def count(self) -> int:
         return sum(jnp.size(leaf) for leaf in jax.tree.leaves(self.values))
 
-    def moved(self, step: Step | Float[Array, " count"]) -> "Numbers":
+    def move(self, step: Step | Float[Array, " count"]) -> "Numbers":
         flat, unravel = ravel_pytree(self.values)
         return Numbers(unravel(flat + jnp.asarray(step)))
 

@@ -14,12 +14,11 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     successful = ""
     rank_deficient = (
         "The measurements do not determine the parameters: a combination of these can "
-        "change without changing any "
-        "residual. Measure more, and elsewhere (not all on one line, not all in one "
-        "zone)."
+        "change without changing any residual. Measure more, and elsewhere (not all on "
+        "one line, not all in one zone)."
     )
     diverged = (
         "The iterations did not converge. Look for gross errors in what was measured "
-        "and in what was given (constants, "
-        "the directions of axes), or give a better start."
+        "and in what was given (constants, the directions of axes), or give a better "
+        "start."
     )

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from ..adjustment.guarded import root
-from ..geometry.mock_pairs import planted
+from ..geometry.mock_pairs import plant
 from ..geometry.pairs import Pair
 from ..orientation.orient import orient
 from ..xla.passes import total
@@ -57,7 +57,7 @@ class LeftCoordinates(AbstractSource):
 
     def displaced(self, given, errors):
         return given._replace(
-            pair=planted(given.pair, x_left=errors[0], y_left=errors[1])
+            pair=plant(given.pair, x_left=errors[0], y_left=errors[1])
         )
 
 
@@ -72,7 +72,7 @@ class RightCoordinates(AbstractSource):
 
     def displaced(self, given, errors):
         return given._replace(
-            pair=planted(given.pair, x_right=errors[0], y_right=errors[1])
+            pair=plant(given.pair, x_right=errors[0], y_right=errors[1])
         )
 
 
@@ -121,7 +121,7 @@ class PrincipalPoint(AbstractSource):
             *(("x_right", "y_right") if self.right else ()),
         )
         return given._replace(
-            pair=planted(given.pair, **dict(zip(names, (x, y) * 2, strict=False)))
+            pair=plant(given.pair, **dict(zip(names, (x, y) * 2, strict=False)))
         )
 
 

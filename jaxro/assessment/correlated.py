@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..adjustment import normal_equations as normal
 from ..geometry import coplanarity
 from ..geometry.linear import linearised
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.result import Orientation
 from .neighbours import agreement
 
@@ -43,7 +43,7 @@ def correlated_covariance(
     them. Works under jit and vmap; its memory grows with the square of the number of
     points.
     """
-    pair = cleaned(pair)[0]
+    pair = mask_unusable(pair)[0]
     residuals = coplanarity.residuals(pair, orientation.elements)
     _, columns, weights = residuals.columns((jnp.zeros_like(pair.focal_left),) * 5)
     root = jnp.sqrt(weights[0])  # pyright: ignore[reportOptionalSubscript]

@@ -89,10 +89,10 @@ def _of_parameters(orientation: Orientation):
 
     def linearly(pose: RelativePose, length):
         def shared(*x):
-            moved = pose.moved(x)
+            moved = pose.move(x)
             chosen = convert(moved, system, length)
             base = moved.relative()[1]
-            scaled = rot.scaled(base, system.scale(base, length))
+            scaled = rot.scale(base, system.scale(base, length))
             return (x if system is RelativePose else chosen.values()), (
                 scaled,
                 chosen.model_frame()[2],
@@ -185,7 +185,7 @@ def _on_m_q(
     jump more.
     """
     left, right = (
-        frame[2] for frame in coplanarity.turned(*orientation.pose.relative())
+        frame[2] for frame in coplanarity.turn_to_base(*orientation.pose.relative())
     )
 
     def ratio(point):

@@ -28,7 +28,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from ..adjustment import critical_values as critical
 from ..geometry.linear import linearised
-from ..geometry.pairs import Coordinates, Pair, cleaned
+from ..geometry.pairs import Coordinates, Pair, mask_unusable
 from ..orientation.result import Orientation
 from .correlations import Normalised, normalised
 from .familywise import largest_w
@@ -216,7 +216,7 @@ def _normalised(pair: Pair, orientation: Orientation) -> tuple[Pair, Normalised]
             f"one pair is wanted, but the coordinates have shape {pair.x_left.shape}: "
             "use jax.vmap"
         )
-    pair, _ = cleaned(pair)
+    pair, _ = mask_unusable(pair)
     return pair, normalised(
         linearised(pair, orientation.pose), pair.mask & orientation.usable
     )

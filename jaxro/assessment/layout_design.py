@@ -249,7 +249,7 @@ def height_deviations(
     )
 
     def height(step, point):
-        moved = found.moved(step)
+        moved = found.move(step)
         (rotation, along), frame = moved.relative(), moved.model_frame()
         f = coplanarity.fundamental_matrix(*moved.relative(), *focals)
         v = coplanarity.corrections(f, point, jnp.asarray(True))
@@ -257,7 +257,7 @@ def height_deviations(
         first, second = coplanarity.directions(
             frame, rot.product(frame, rotation), corrected, *focals
         )
-        along = rot.scaled(rot.apply(frame, along), length)
+        along = rot.scale(rot.apply(frame, along), length)
         lam, mu, near = coplanarity.depths(first, second, along)
         return coplanarity.halfway(first, second, along, lam * near, mu * near)[2]
 

@@ -37,7 +37,7 @@ from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
 from ..geometry.linear import Linear, linearised
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.result import Orientation
 
 LENGTHS = (0.025, 0.05, 0.1, 0.2)
@@ -83,7 +83,7 @@ def pattern(pair: Pair, orientation: Orientation) -> Pattern:
 
     Works under jit and vmap; its memory grows with the square of the number of points.
     """
-    pair = cleaned(pair)[0]
+    pair = mask_unusable(pair)[0]
     return of_linear(linearised(pair, orientation.pose), pair.coordinates)
 
 

@@ -140,7 +140,7 @@ def propagate_adjusted(
     variance = jnp.asarray(solved.sigma0 if sigma0 is None else sigma0) ** 2
     origin = jnp.zeros(solved.cofactor.shape[-1], solved.cofactor.dtype)
     return propagate(
-        lambda step: function(as_given(found.moved(tuple(step)))),
+        lambda step: function(as_given(found.move(tuple(step)))),
         origin,
         variance * solved.cofactor,
     )

@@ -34,7 +34,7 @@ from ..adjustment import critical_values as critical
 from ..adjustment.guarded import root
 from ..adjustment.normal_equations import accumulate, inverse
 from ..geometry.linear import Linear, linearised
-from ..geometry.pairs import Coordinates, Pair, cleaned
+from ..geometry.pairs import Coordinates, Pair, mask_unusable
 from ..orientation.result import Orientation
 from ..xla.kernels import computed_once
 from ..xla.passes import count
@@ -291,7 +291,7 @@ def _assess(
     power: float,
     familywise: bool,
 ):
-    pair, orientation = cleaned(read[0])[0], read[1]
+    pair, orientation = mask_unusable(read[0])[0], read[1]
     use = pair.mask & orientation.usable
     linear = linearised(pair, orientation.pose)
     z, h, squares = computed_once(_solved)(linear)

@@ -25,7 +25,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..adjustment import normal_equations as normal
 from ..geometry.linear import Linear, linearised
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.result import Orientation
 from ..xla.passes import sums, total
 from ..xla.programs import Program, is_traced
@@ -122,7 +122,7 @@ def _estimate(
     pairs, orientations = data
     shape = pairs.x_left.shape
     parted = [jnp.broadcast_to(g if g.ndim != 1 else g[None, :], shape) for g in labels]
-    pairs = jax.vmap(lambda p: cleaned(p)[0])(pairs)
+    pairs = jax.vmap(lambda p: mask_unusable(p)[0])(pairs)
     pairs = pairs.with_mask(pairs.mask & orientations.usable[:, None])
     linear = jax.vmap(linearised)(pairs, orientations.pose)
     parts = [

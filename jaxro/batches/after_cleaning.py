@@ -18,7 +18,7 @@ from ..adjustment import critical_values
 from ..adjustment.normal_equations import solve
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.results import is_usable
 from ..rejection import AbstractProcedure, Rejection
 from ..xla.passes import count
@@ -90,7 +90,7 @@ def after_cleaning(
     ten sigma. Smaller errors are harder to find: the shares hold for errors of this
     size.
     """
-    pair, _ = cleaned(pair)
+    pair, _ = mask_unusable(pair)
     pairs, wrong = trials(
         pair, rejection, key, repetitions, sigma0=sigma0, largest=largest
     )
@@ -202,7 +202,7 @@ def errorless(pair: Pair, pose: RelativePose, kept: Bool[Array, "point"]):
             v = coplanarity.corrections(f, moved, use)
             moved = tuple(c + e for c, e in zip(moved, v, strict=True))
         ray = (point[0], point[1], -pair.focal_left)
-        level = rot.shifted(ray, base, -mean)
+        level = rot.add_scaled(ray, base, -mean)
         x, y, z = rot.apply(back, level)
         z = jnp.where(z < 0, z, -pair.focal_left)
         partner = (

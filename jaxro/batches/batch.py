@@ -138,7 +138,7 @@ def orient_slabs(
     """read(pair, orientation) of every pair, in NumPy."""
     chunk = _chunk(pairs, split.chunk)
     options = {"problem": problem, "read": read, "chunk": chunk}
-    program = Program(_slab, options, _settings(pairs))
+    program = Program(_orient_slab, options, _settings(pairs))
     return spread(pairs, program, split, chunk, report)
 
 
@@ -163,7 +163,9 @@ def orient_slabs_near(
             RUN_FAST | WIDE_VECTORS | UNSPLIT_LOOPS,
         )
     kernel = kernel if problem.solver is None else None
-    program = Program(_slab_near, options, _settings(pairs, lasting), kernel=kernel)
+    program = Program(
+        _orient_slab_near, options, _settings(pairs, lasting), kernel=kernel
+    )
     return spread(pairs, program, split, chunk, report)
 
 
@@ -246,7 +248,7 @@ def clean_slabs(
     if split.chunk is None:
         chunk = min(chunk, _searched_together(procedure))
     program = Program(
-        _slab_cleaned,
+        _clean_slab,
         {"procedure": procedure, "select": select, "chunk": chunk},
         _settings(pairs),
     )
@@ -271,7 +273,7 @@ def map_batch(
     """
     chunk = _chunk(pairs, chunk)
     program = Program(
-        _slab_mapped, {"function": function, "chunk": chunk}, _settings(pairs)
+        _map_slab, {"function": function, "chunk": chunk}, _settings(pairs)
     )
     host, split = jax.tree.map(np.asarray, pairs), Split(threads, chunk)
     return _finish(spread(host, program, split, chunk, progress or silent))
@@ -315,15 +317,17 @@ def _settings(pairs: Pair, lasting: dict[str, Any] | None = None) -> dict[str, A
     return RUN_FAST if pairs.x_left.shape[1] > FEW else RUN_FAST | WIDE_VECTORS
 
 
-def _slab(pairs: Pair, *, problem: Problem, read: Callable, chunk: int) -> PyTree:
+def _orient_slab(
+    pairs: Pair, *, problem: Problem, read: Callable, chunk: int
+) -> PyTree:
     return map_chunks(lambda pair: read(pair, orient_once(pair, problem)), pairs, chunk)
 
 
-def _slab_mapped(pairs: Pair, *, function: Callable, chunk: int) -> PyTree:
+def _map_slab(pairs: Pair, *, function: Callable, chunk: int) -> PyTree:
     return map_chunks(function, pairs, chunk)
 
 
-def _slab_near(
+def _orient_slab_near(
     pairs: Pair, *, problem: Problem, read: Callable, chunk: int
 ) -> tuple[PyTree, Array]:
     def one(pair: Pair):
@@ -333,7 +337,7 @@ def _slab_near(
     return map_chunks(one, pairs, chunk)
 
 
-def _slab_cleaned(
+def _clean_slab(
     pairs: Pair, *, procedure: AbstractProcedure, select: Callable, chunk: int
 ) -> tuple[PyTree, Array]:
     """What is selected, and whether the procedure was not convinced."""

@@ -45,9 +45,8 @@ def sizes(lengths: Int[np.ndarray, " pair"], most: int = SIZES) -> tuple[int, ..
         counts[: np.flatnonzero(counts)[-1] + 1],
     )
     below = np.concatenate([[0], np.cumsum(counts)])  # pairs up to each step
-    cost = np.where(
-        np.arange(len(below)) == 0, 0.0, np.inf
-    )  # of all pairs up to a step, with the sizes so far
+    # of all pairs up to a step, with the sizes so far
+    cost = np.where(np.arange(len(below)) == 0, 0.0, np.inf)
     choices, best = [], (np.inf, 0)
     for k in range(most):
         whole = cost[None, :] + known[:, None] * (below[1:, None] - below[None, :])
@@ -76,7 +75,7 @@ CALL_POINTS = tuple(1 << bits for bits in (17, 15, 13))
 one table serve others."""
 
 
-def planned(lengths: Int[np.ndarray, " pair"], parts: int = 1) -> Plan:
+def plan_for(lengths: Int[np.ndarray, " pair"], parts: int = 1) -> Plan:
     """A plan for pairs of these lengths that come in so many parts of about the same
     kind."""
     chosen = sizes(lengths)

@@ -25,7 +25,7 @@ from .batch import (
     problem_of_all,
     stages,
 )
-from .padding import Plan, planned
+from .padding import Plan, plan_for
 
 LONG = 64
 """Points from which values are moved quicker pair by pair than all together."""
@@ -52,7 +52,7 @@ class Ragged(NamedTuple):
         """Points of every pair."""
         return np.diff(self.begins)
 
-    def padded(self, members: Int[np.ndarray, " some"], size: int) -> Pair:
+    def pad_to(self, members: Int[np.ndarray, " some"], size: int) -> Pair:
         """These pairs as one batch, in NumPy. What stands behind a shorter one up to
         `size` points is masked out."""
         first, last, lengths = members[0], members[-1], self.lengths[members]
@@ -142,7 +142,7 @@ def join(pairs: Sequence[Pair]) -> Ragged:
     )
 
 
-def joined(parts: Sequence[Ragged]) -> Ragged:
+def concatenate(parts: Sequence[Ragged]) -> Ragged:
     """The pairs of several `Ragged` one behind the other."""
     ends = np.cumsum([0] + [part.begins[-1] for part in parts])
     begins = np.concatenate(
@@ -157,7 +157,7 @@ def joined(parts: Sequence[Ragged]) -> Ragged:
     )
 
 
-def checked(pairs: Ragged) -> Ragged:
+def check(pairs: Ragged) -> Ragged:
     """The pairs in double precision. Raises ValueError where there are none."""
     if len(pairs.begins) < 2:
         raise ValueError(
@@ -197,22 +197,21 @@ def orient_ragged(
     the result then is these two. Other keywords are those of `orient`. The results are
     those of `orient` one by one, to rounding.
     """
-    pairs = checked(pairs)
+    pairs = check(pairs)
     plan = _fitting(plan, pairs)
     problem = problem_of_all(options | {"start": start})
     out = _Out(pairs, progress)
     rest = [np.zeros(0, int)]
     batches = _batches(pairs, plan.sizes, plan.slabs, threads)
     in_turn = threads == 1 or len(batches) == 1
-    told = (
-        out.told if in_turn else silent
-    )  # what runs beside the calling thread tells nobody
+    # what runs beside the calling thread tells nobody
+    told = out.told if in_turn else silent
 
     def near(
         members: np.ndarray, size: int, slabs: Split
     ) -> tuple[np.ndarray, int, PyTree, np.ndarray]:
         found, fits = orient_slabs_near(
-            pairs.padded(members, size), problem, read, slabs, told
+            pairs.pad_to(members, size), problem, read, slabs, told
         )
         return members, size, found, members[~fits]
 
@@ -222,7 +221,7 @@ def orient_ragged(
         return (
             members,
             size,
-            orient_slabs(pairs.padded(members, size), problem, read, slabs, told),
+            orient_slabs(pairs.pad_to(members, size), problem, read, slabs, told),
             members[:0],
         )
 
@@ -238,7 +237,7 @@ def orient_ragged(
     for members, size, slabs in _batches(
         pairs, plan.fewer, None, threads, np.concatenate(rest)
     ):
-        again = orient_slabs(pairs.padded(members, size), general, read, slabs)
+        again = orient_slabs(pairs.pad_to(members, size), general, read, slabs)
         out.store(members, size, again)
     return eqx.combine(*out.tree) if read is split else out.tree
 
@@ -280,17 +279,16 @@ def clean_ragged(
     `select(rejection)`: what is wanted instead, of the pair and of every point; the
     result then is these two.
     """
-    pairs = checked(pairs)
+    pairs = check(pairs)
     plan = _fitting(plan, pairs)
     out = _Out(pairs, progress)
     every = stages(procedure, max(plan.sizes))
-    doubtful = [
-        [np.zeros(0, int)] for _ in every
-    ]  # by the number of procedures that are left for a pair
+    # by the number of procedures that are left for a pair
+    doubtful = [[np.zeros(0, int)] for _ in every]
     for members, size, slabs in _batches(pairs, plan.sizes, None, threads):
         first, *others = stages(procedure, size)
         found, doubt = clean_slabs(
-            pairs.padded(members, size), first, select, slabs, out.told
+            pairs.pad_to(members, size), first, select, slabs, out.told
         )
         out.store(members, size, found)
         doubtful[len(others)].append(members[doubt])
@@ -299,7 +297,7 @@ def clean_ragged(
             pairs, plan.fewer, None, threads, np.concatenate(doubtful[left])
         ):
             found, doubt = clean_slabs(
-                pairs.padded(members, size), every[-left], select, slabs, silent
+                pairs.pad_to(members, size), every[-left], select, slabs, silent
             )
             out.store(members, size, found)
             doubtful[left - 1].append(members[doubt])
@@ -318,13 +316,13 @@ def clean_ragged(
 def _fitting(plan: Plan | None, pairs: Ragged) -> Plan:
     """The plan, or one for these pairs. Raises ValueError if it is for shorter ones."""
     if plan is None:
-        return planned(pairs.lengths)
+        return plan_for(pairs.lengths)
     longest, most = int(np.max(pairs.lengths)), min(plan.sizes[-1], plan.fewer[-1])
     if longest > most:
         raise ValueError(
             f"the plan is for pairs of up to {most} points, but pair "
-            f"{int(np.argmax(pairs.lengths))} has {longest}: "
-            "plan with the longest of all parts"
+            f"{int(np.argmax(pairs.lengths))} has {longest}: plan with the longest of "
+            "all parts"
         )
     return plan
 
@@ -357,9 +355,8 @@ def _overlapping(work: Callable, batches: Sequence[tuple]) -> Iterator[tuple]:
     try:
         yield from pool.map(lambda batch: work(*batch), reversed(batches))
     finally:
-        pool.shutdown(
-            wait=False, cancel_futures=True
-        )  # who interrupts does not wait for a program to be compiled
+        # who interrupts does not wait for a program to be compiled
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 class _Out:
@@ -391,8 +388,8 @@ class _Out:
             if of_points.shape[:2] != (len(members), size):
                 raise ValueError(
                     "what is read of every point has the points on its first axis, "
-                    f"{size} of them here, but a value "
-                    f"has the shape {of_points.shape[1:]}"
+                    f"{size} of them here, but a value has the shape "
+                    f"{of_points.shape[1:]}"
                 )
         if len(members) == len(self._pairs.lengths) and np.all(
             self._pairs.lengths == size

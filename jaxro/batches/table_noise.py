@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..geometry.pairs import Pair, cleaned, double
+from ..geometry.pairs import Pair, double, mask_unusable
 from ..rejection import Noise, Recommended, noise_of, pooled
 from ..rejection.hypotheses import squares
 from ..rejection.noise import PARAMETERS
@@ -116,9 +116,8 @@ def estimate(pairs: Pair | Ragged | Iterable[Pair]) -> TableNoise:
             "no pair has six points or more, which would show the noise: state the "
             "standard deviation"
         )
-    unit = float(
-        np.median(_focal_in_sigma(jax.device_put(chosen)))
-    )  # a start is one for all pairs
+    # a start is one for all pairs
+    unit = float(np.median(_focal_in_sigma(jax.device_put(chosen))))
     blocks = -(-asked // BLOCK)
     size = asked // blocks
     parts = [
@@ -128,14 +127,13 @@ def estimate(pairs: Pair | Ragged | Iterable[Pair]) -> TableNoise:
     if not part.any():
         raise ValueError(
             "the residuals tell no noise: not enough points agree with one pose of "
-            "their pair; "
-            "state the standard deviation"
+            "their pair; state the standard deviation"
         )
     if part.sum() < TELLING * len(part):
         raise ValueError(
             f"only {part.sum()} of {len(part)} pairs have enough points that agree to "
-            "tell their noise, and those with "
-            "the least noise are the first to: state the standard deviation"
+            "tell their noise, and those with the least noise are the first to: state "
+            "the standard deviation"
         )
     noise = _together(found, part)
     return TableNoise(
@@ -155,7 +153,7 @@ class _Read(NamedTuple):
 
 def _read(pair: Pair) -> _Read:
     """What the pose of a pair leaves, whose sigma is where the search begins."""
-    pair = cleaned(pair)[0]
+    pair = mask_unusable(pair)[0]
     s = squares(pair, FINDER(pair).orientation.pose)
     return _Read(
         jnp.sqrt(s), pair.mask, FIELD * _focal_in_sigma(pair), noise_of(s, pair.mask)
@@ -284,7 +282,7 @@ def _sample(pairs: Pair | Ragged | Iterable[Pair]) -> Pair | None:
         chosen = _spread(np.add.reduceat(ragged.mask.astype(int), ragged.begins[:-1]))
         rows = [
             jax.tree.map(
-                lambda a: a[0], ragged.padded(np.array([k]), int(ragged.lengths[k]))
+                lambda a: a[0], ragged.pad_to(np.array([k]), int(ragged.lengths[k]))
             )
             for k in chosen
         ]

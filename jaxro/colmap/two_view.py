@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..adjustment import critical_values
 from ..geometry import rotations as rot
 from ..geometry.elements import RelativePose
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation import planes
 from ..orientation.results import RESULTS, is_usable
 from ..orientation.starts.general import rotation_only
@@ -111,7 +111,7 @@ def verdict(rejection: Rejection) -> Verdict:
 
 def classified(pair: Pair, verdict: Verdict) -> Found:
     """What the verdict of the engine on a pair is worth."""
-    pair = cleaned(pair)[0]
+    pair = mask_unusable(pair)[0]
     each = lambda n: critical_values.normal(ENGINE.level / jnp.maximum(n, 1.0))
     limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
     plane = in_plane(pair, verdict.pose, verdict.mask, limit)
@@ -159,7 +159,7 @@ def in_plane(
     def once(state):
         needed, first = state
         # depends on the round, or it would be computed of every scene
-        inside = cleaned(pair.with_mask(pair.mask & needed))[0]
+        inside = mask_unusable(pair.with_mask(pair.mask & needed))[0]
         other, exists = planes.second(
             inside.with_mask(inside.mask & flat.within), pose, flat.normal
         )
@@ -213,7 +213,7 @@ def certain(
 ) -> Bool[Array, ""]:
     """Whether so many matches, each counted once, do not agree by accident."""
     again, _ = evidence.repeats(pair)
-    once = cleaned(pair.with_mask(pair.mask & ~again))[0]
+    once = mask_unusable(pair.with_mask(pair.mask & ~again))[0]
     agreed, asked = evidence.shifted_agreement(once, pose, limit)
     chance = (agreed + 1) / (asked + 2)
     return evidence.accidents(

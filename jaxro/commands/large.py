@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from .. import __version__
-from ..batches.padding import planned
-from ..batches.ragged import Ragged, joined
+from ..batches.padding import plan_for
+from ..batches.ragged import Ragged, concatenate
 from ..batches.table_noise import PAIRS
 from ..rejection import AbstractProcedure
 from ..reports.pair import table as terminal_table
@@ -215,7 +215,7 @@ def _planned(
         source.absolute(),
         options.file,
         folder,
-        planned(scan.lengths, len(pieces)),
+        plan_for(scan.lengths, len(pieces)),
         cameras,
         sigma,
         Recorder(system, order, known, procedure is not None),
@@ -232,7 +232,7 @@ def _sample(table: parquet.Source, scan: parquet.Scan, cameras: Cameras) -> Ragg
     count = len(scan.begins) - 1
     run, places = (count, 1) if count <= PAIRS else (PAIRS // PLACES, PLACES)
     firsts = np.linspace(0, count - run, places).astype(int)
-    return joined(
+    return concatenate(
         [
             _rows(table, scan.begins[first : first + run + 1], cameras)
             for first in firsts

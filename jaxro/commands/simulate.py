@@ -137,7 +137,7 @@ def layouts_of(options: Options, warnings: Any) -> dict[str, Pair]:
             expected="the standard deviation to simulate",
         )
     x_left, y_left, x_right, y_right = solved.corrections(pair)
-    exact = mock_pairs.planted(
+    exact = mock_pairs.plant(
         pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right
     )
     size = f"{float(jnp.mean(sigma)):.3g} {options.unit}"

@@ -28,7 +28,7 @@ import numpy as np
 
 from ..batches.batch import clean_batch
 from ..geometry import mock_pairs
-from ..geometry.mock_pairs import noisy, planted
+from ..geometry.mock_pairs import noisy, plant
 from ..geometry.pairs import Pair
 from ..rejection import AbstractProcedure, Rejection, TwoStage
 from ..xla.programs import Program
@@ -277,7 +277,7 @@ def _simulated(plan: tuple):
             jax.random.uniform(size, wrong.shape, float, limits[0], limits[1]) * SIGMA
         )
         signed = jnp.where(jax.random.bernoulli(sign, shape=wrong.shape), sizes, -sizes)
-        silent = planted(exact, y_right=jnp.where(wrong, signed, 0.0))
+        silent = plant(exact, y_right=jnp.where(wrong, signed, 0.0))
         return silent, noisy(silent, noise, SIGMA), wrong
 
     silent, measured, wrong = jax.vmap(one)(*drawn)
@@ -291,7 +291,7 @@ def _named(exact: Pair) -> Pair:
     errors = np.zeros((len(NAMED), exact.x_left.shape[0]))
     for row, variant in zip(errors, NAMED.values(), strict=True):
         row[[point - 1 for point in variant.errors]] = list(variant.errors.values())
-    return jax.vmap(lambda y: planted(exact, y_right=y))(jnp.asarray(errors))
+    return jax.vmap(lambda y: plant(exact, y_right=y))(jnp.asarray(errors))
 
 
 def _decision(found: Rejection):

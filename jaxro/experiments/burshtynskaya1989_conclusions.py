@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from ..geometry import mock_pairs
-from ..geometry.mock_pairs import noisy, planted
+from ..geometry.mock_pairs import noisy, plant
 from ..geometry.pairs import Pair
 
 SIGMA = 0.01
@@ -71,7 +71,7 @@ def plan() -> Plan:
 
 def measured(exact: Pair, errors, key) -> Pair:
     """The pairs of a plan with noise."""
-    one = lambda row, key: planted(noisy(exact, key, SIGMA), y_right=row)
+    one = lambda row, key: plant(noisy(exact, key, SIGMA), y_right=row)
     return jax.vmap(one)(errors, jax.random.split(key, len(errors)))
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from ..batches.batch import clean_batch
 from ..geometry.elements import RelativePose
-from ..geometry.mock_pairs import noisy, planted
+from ..geometry.mock_pairs import noisy, plant
 from ..geometry.pairs import Pair
 from ..orientation.orient import orient
 from ..orientation.results import is_usable
@@ -190,7 +190,7 @@ def _simulated(plan: tuple):
         wrong = (jnp.argsort(jnp.argsort(chance)) < errors) & exact.mask
         side = jnp.where(jax.random.bernoulli(sign, shape=wrong.shape), 1.0, -1.0)
         measured = noisy(exact, noise, exact.sigma[None, :])
-        return planted(
+        return plant(
             measured, y_right=jnp.where(wrong, side * size * exact.sigma, 0.0)
         ), wrong
 

@@ -208,12 +208,12 @@ def ten_points() -> Pair:
     """The ten points of the introduction, an error of +2.0 mm at point 7."""
     x, y = zip(*(mock_pairs.ZONES[zone] for zone in TEN_ZONES), strict=True)
     flat = mock_pairs.mock_pair(mock_pairs.Layout(x, y, TEN_ZONES))
-    return mock_pairs.planted(flat, y_right=2.0 * (np.arange(len(TEN_ZONES)) == 6))
+    return mock_pairs.plant(flat, y_right=2.0 * (np.arange(len(TEN_ZONES)) == 6))
 
 
 def table_1(errors: Float[Array, "point"]) -> Pair:
     """The mock pair of table 1 with as many points as errors are given."""
-    return mock_pairs.planted(
+    return mock_pairs.plant(
         mock_pairs.mock_pair(mock_pairs.standard_layout(len(errors))), y_right=errors
     )
 
@@ -226,7 +226,7 @@ def table_2() -> Pair:
     flat = mock_pairs.mock_pair(
         layout, elements, focal=70.64, base=63.99, y_range=(64.07, 62.32)
     )
-    return mock_pairs.planted(flat, y_right=np.array([0, 0, 0, 0, 0, 0, 1.10, 1.20]))
+    return mock_pairs.plant(flat, y_right=np.array([0, 0, 0, 0, 0, 0, 1.10, 1.20]))
 
 
 def _decisions(pairs: Pair, corrections: int) -> list[Decision]:

@@ -60,7 +60,7 @@ def condition(f: Matrix, point: Point) -> Scalar:
     return x1 * a + y1 * b + c
 
 
-def turned(rotation: Matrix, base: Vector) -> tuple[Matrix, Matrix]:
+def turn_to_base(rotation: Matrix, base: Vector) -> tuple[Matrix, Matrix]:
     """Rotations of the left and right photo into the frame parallel to the base.
 
     X runs along the base and the left photo is not turned about X: Y = z x X / |z x X|
@@ -79,7 +79,7 @@ def y_parallax(
     rows: tuple, point: Point, focal_left: Scalar, focal_right: Scalar
 ) -> Scalar:
     """q = y1* - y2* = -f1 (Y1/Z1 - Y2/Z2) of one point; `rows` are the Y and Z rows of
-    the two rotations `turned`."""
+    the two rotations of `turn_to_base`."""
     x1, y1, x2, y2 = point
     rays = (x1, y1, -focal_left), (x2, y2, -focal_right)
     (y1, z1), (y2, z2) = (
@@ -93,7 +93,7 @@ def y_parallax(
 
 def parallax_of(pair: Pair, pose: AbstractElements) -> Callable:
     """q of a point of a pair, as a function of its coordinates."""
-    rows = tuple(frame[1:] for frame in turned(*pose.relative()))
+    rows = tuple(frame[1:] for frame in turn_to_base(*pose.relative()))
     return lambda point: y_parallax(rows, point, pair.focal_left, pair.focal_right)
 
 
@@ -122,7 +122,7 @@ def parallax(pair: Pair) -> Term:
     are taken as free of error."""
 
     def prepare(rotation: Matrix, base: Vector):
-        left, right = turned(rotation, base)
+        left, right = turn_to_base(rotation, base)
         return left[1:], right[1:], pair.focal_left, pair.focal_right
 
     def of_point(prepared: tuple, observation: tuple[Point, Scalar]) -> Scalar:
@@ -135,7 +135,7 @@ def parallax(pair: Pair) -> Term:
     return Term(of_point, observations, cofactor, mask=pair.mask, prepare=prepare)
 
 
-def linearised(
+def linearise(
     f: Matrix, point: Point, use: Bool[Array, "..."]
 ) -> tuple[Scalar, Scalar, Point]:
     """g of one point, the square |B|² of its gradient by the coordinates (1 where it is
@@ -150,7 +150,7 @@ def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:
 
     sigma is equal for the four coordinates of a point, so it cancels.
     """
-    g, square, gradient = linearised(f, point, use)
+    g, square, gradient = linearise(f, point, use)
     factor = jnp.where(use, -g / square, 0.0)
     return tuple(factor * entry for entry in gradient)  # pyright: ignore[reportReturnType]
 

@@ -62,11 +62,11 @@ class AbstractElements(AbstractParameters):
         return self.relative()
 
     @abc.abstractmethod
-    def moved(self, step: Step | Float[Array, " count"]) -> "AbstractElements":
+    def move(self, step: Step | Float[Array, " count"]) -> "AbstractElements":
         """The elements after a small displacement of their five (local) parameters."""
 
     @abc.abstractmethod
-    def normalised(self) -> "AbstractElements":
+    def normalise(self) -> "AbstractElements":
         """The same elements in their standard form (unit quaternion and base)."""
 
     @abc.abstractmethod
@@ -136,7 +136,7 @@ class RelativePose(AbstractElements):
     def model_frame(self) -> Matrix:
         return rot.identity(self.qw)
 
-    def moved(self, step: Step | Float[Array, " count"]) -> "RelativePose":
+    def move(self, step: Step | Float[Array, " count"]) -> "RelativePose":
         a, b, c, u, v = step
         a, b, c = a / 2, b / 2, c / 2
         w, x, y, z = self.qw, self.qx, self.qy, self.qz
@@ -158,7 +158,7 @@ class RelativePose(AbstractElements):
         """The right photo turns about its own axes: R [e_k]x is R with two columns
         exchanged, one of them negative. The base moves by its stereographic
         coordinates."""
-        rotation, base = self.moved(x).relative()
+        rotation, base = self.move(x).relative()
         columns = rot.transpose(rotation)
         along = []
         for k in range(3):
@@ -195,7 +195,7 @@ class RelativePose(AbstractElements):
         )
         return *turn, x[3] + step[3], x[4] + step[4]
 
-    def normalised(self) -> "RelativePose":
+    def normalise(self) -> "RelativePose":
         """The same pose with quaternion and base of unit length, qw >= 0."""
         q = (self.qw, self.qx, self.qy, self.qz)
         length = jnp.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
@@ -247,12 +247,12 @@ class IndependentElements(AbstractElements):
     def model_frame(self) -> Matrix:
         return rot.product(rot.r_alpha(self.phi1), rot.r_chi(self.kappa1))
 
-    def moved(self, step: Step | Float[Array, " count"]) -> "IndependentElements":
+    def move(self, step: Step | Float[Array, " count"]) -> "IndependentElements":
         return IndependentElements(
             *(value + s for value, s in zip(self.values(), step, strict=True))
         )
 
-    def normalised(self) -> "IndependentElements":
+    def normalise(self) -> "IndependentElements":
         return self
 
     def values(self) -> tuple[Scalar, ...]:
@@ -306,12 +306,12 @@ class DependentElements(AbstractElements):
     def model_frame(self) -> Matrix:
         return rot.identity(self.bx)
 
-    def moved(self, step: Step | Float[Array, " count"]) -> "DependentElements":
+    def move(self, step: Step | Float[Array, " count"]) -> "DependentElements":
         return DependentElements(
             *(value + s for value, s in zip(self.values(), step, strict=True)), self.bx
         )
 
-    def normalised(self) -> "DependentElements":
+    def normalise(self) -> "DependentElements":
         return self
 
     def values(self) -> tuple[Scalar, ...]:
@@ -349,7 +349,7 @@ def vertical(like: Scalar) -> RelativePose:
 def to_pose(elements: AbstractElements) -> RelativePose:
     """Any elements as a unit `RelativePose`."""
     if isinstance(elements, RelativePose):
-        return elements.normalised()
+        return elements.normalise()
     rotation, base = elements.relative()
     return RelativePose(*rot.to_quaternion(rotation), *rot.unit(base))
 

@@ -38,7 +38,7 @@ def model_point(
     frame, right, placed = None, rotation, base
     if not isinstance(chosen, RelativePose):
         x, y, z = chosen.model_frame()
-        frame = rot.scaled(x, scale), rot.scaled(y, scale), rot.scaled(z, scale)
+        frame = rot.scale(x, scale), rot.scale(y, scale), rot.scale(z, scale)
         right, placed = rot.product(frame, rotation), rot.apply(frame, base)
 
     def one(point, sigma, use):
@@ -53,9 +53,8 @@ def model_point(
         uncertain = (SIGNIFICANT * noise * sigma) ** 2 * sum(
             rot.dot(ray, ray) for ray in rays
         ) * near > 1
-        in_front = (
-            use & (lam > 0) & (mu > 0)
-        )  # of parallel rays by the side on which they would meet
+        # of parallel rays by the side on which they would meet
+        in_front = use & (lam > 0) & (mu > 0)
         lam, mu = lam * near, mu * near
         model = coplanarity.halfway(
             *coplanarity.directions(frame, right, corrected, *focals), placed, lam, mu

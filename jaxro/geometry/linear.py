@@ -38,7 +38,7 @@ class Linear(NamedTuple):
 @jax.jit  # traced once for all who ask
 def linearised(pair: Pair, pose: RelativePose) -> Linear:
     """The rigorous conditions of one pair at a pose, with its sigma; the pair is
-    `cleaned`."""
+    free of unusable points."""
     residuals = coplanarity.residuals(pair, pose)
     (g,), jacobian, weight = residuals.columns((jnp.zeros_like(pair.focal_left),) * 5)
     f = coplanarity.fundamental_matrix(

@@ -124,14 +124,14 @@ def mock_pair(
     right = rot.product(left, rotation)
 
     def photos(x, y, scale):
-        point = rot.scaled((x, y, -focal), scale)
+        point = rot.scale((x, y, -focal), scale)
         beyond = (point[0] - base, point[1], point[2])
-        return *projected(left, point, focal), *projected(right, beyond, focal)
+        return *project(left, point, focal), *project(right, beyond, focal)
 
     return pair(*jax.vmap(photos)(x, y, scale), focal=focal)
 
 
-def projected(
+def project(
     rotation: rot.Matrix, ray: rot.Vector, focal: ArrayLike
 ) -> tuple[rot.Scalar, rot.Scalar]:
     """Photo coordinates of one ray in a photo turned by `rotation` (photo to model)."""
@@ -148,7 +148,7 @@ def relief(
     )
 
 
-def planted(
+def plant(
     one: Pair,
     *,
     x_left: ArrayLike = 0.0,
@@ -170,7 +170,7 @@ def noisy(one: Pair, key: PRNGKeyArray, sigma: ArrayLike) -> Pair:
     """The pair with normal errors of standard deviation `sigma` (mm) in all four
     coordinates of its points."""
     errors = sigma * jax.random.normal(key, (4, *one.x_left.shape), float)
-    return planted(
+    return plant(
         one, x_left=errors[0], y_left=errors[1], x_right=errors[2], y_right=errors[3]
     )
 
@@ -219,9 +219,9 @@ def _random_pair(key, points, focal, depth):
     )
 
     def photos(key, distance):
-        point = rot.scaled(rot.apply(cloud_left, _towards(key, CONE, 1.0)), distance)
+        point = rot.scale(rot.apply(cloud_left, _towards(key, CONE, 1.0)), distance)
         beyond = (point[0] - base[0], point[1] - base[1], point[2] - base[2])
-        return *projected(rot.identity(focal), point, focal), *projected(
+        return *project(rot.identity(focal), point, focal), *project(
             rotation, beyond, focal
         )
 

@@ -211,7 +211,7 @@ def pair(
             f"lengths {shape[:-1]}"
         )
         raise ValueError(f"pair: {fit}: {error}") from None
-    return _filled([*coordinates, deviation, taking_part, *focals])
+    return _as_pair([*coordinates, deviation, taking_part, *focals])
 
 
 def _library(values: PyTree) -> ModuleType:
@@ -220,7 +220,7 @@ def _library(values: PyTree) -> ModuleType:
     return jnp if is_traced(values) else np
 
 
-def _filled(fields: list) -> Pair:
+def _as_pair(fields: list) -> Pair:
     """A `Pair` of these arrays, which nobody else changes: their memory is not
     copied."""
     return Pair(*(fields if is_traced(fields) else jax.device_put(fields)))
@@ -235,8 +235,7 @@ def double(one: PyTree) -> PyTree:
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError(
             "jaxro adjusts in double precision, which is switched off in JAX: leave "
-            "JAX_ENABLE_X64 unset, or call "
-            "jax.config.update('jax_enable_x64', True)"
+            "JAX_ENABLE_X64 unset, or call jax.config.update('jax_enable_x64', True)"
         )
 
     def doubled(a):
@@ -250,10 +249,10 @@ def double(one: PyTree) -> PyTree:
 def pad(one: Pair, points: int) -> Pair:
     """The pair with zeros up to `points` places, masked out. Raises ValueError if it
     has more."""
-    return _filled(_padded(one, points, _library(one)))
+    return _as_pair(_pad_fields(one, points, _library(one)))
 
 
-def _padded(one: Pair, points: int, xp: ModuleType) -> list:
+def _pad_fields(one: Pair, points: int, xp: ModuleType) -> list:
     """New fields of a `Pair`, with so many places."""
     missing = points - one.x_left.shape[-1]
     if missing < 0:
@@ -287,8 +286,8 @@ def stack(pairs: Sequence[Pair], points: int | None = None) -> Pair:
         )
     longest = max(one.x_left.shape[-1] for one in pairs) if points is None else points
     xp = _library(pairs)
-    rows = [_padded(one, longest, xp) for one in pairs]
-    return _filled([xp.stack(fields) for fields in zip(*rows, strict=True)])
+    rows = [_pad_fields(one, longest, xp) for one in pairs]
+    return _as_pair([xp.stack(fields) for fields in zip(*rows, strict=True)])
 
 
 def unstack(batch: Pair) -> list[Pair]:
@@ -302,7 +301,7 @@ def unstack(batch: Pair) -> list[Pair]:
         batch = jax.tree.map(np.array, batch)  # what is made of it keeps its memory
     fields = jax.tree.leaves(batch)
     return [
-        _filled([field[i] for field in fields]) for i in range(batch.x_left.shape[0])
+        _as_pair([field[i] for field in fields]) for i in range(batch.x_left.shape[0])
     ]
 
 
@@ -329,7 +328,7 @@ SCALE = 1e30
 in any unit: powers of them overflow."""
 
 
-def cleaned(one: Pair) -> tuple[Pair, Bool[Array, "*pairs"]]:
+def mask_unusable(one: Pair) -> tuple[Pair, Bool[Array, "*pairs"]]:
     """The pair with points that are not finite masked and zeroed, and whether anything
     had to be left out.
 

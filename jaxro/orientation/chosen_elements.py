@@ -34,7 +34,7 @@ def face_points(
         pose.qx,
         pose.qy,
         pose.qz,
-        *rot.scaled((pose.bx, pose.by, pose.bz), sign),
+        *rot.scale((pose.bx, pose.by, pose.bz), sign),
     ), turn
 
 
@@ -70,7 +70,7 @@ def in_system(
     sign = jnp.where(flipped, -1.0, 1.0)
 
     def at(step: tuple) -> AbstractElements:
-        pose = to_pose(solved.moved(step))
+        pose = to_pose(solved.move(step))
         base = (pose.bx * sign, pose.by * sign, pose.bz * sign)
         return convert(
             RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *base), system, length

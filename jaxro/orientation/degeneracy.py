@@ -87,7 +87,7 @@ def worst_direction(
             rotation, base, pair.focal_left, pair.focal_right
         )
 
-    along = lambda t: elements.moved(tuple(t * e for e in direction)).relative()
+    along = lambda t: elements.move(tuple(t * e for e in direction)).relative()
     (rotation, base), (turning, moving) = jax.jvp(
         along, (zero,), (jnp.ones_like(zero),)
     )
@@ -102,8 +102,8 @@ def worst_direction(
     )
 
     def one(point, sigma, use):
-        _, square, b = coplanarity.linearised(f, point, use)
-        g, moved, turned = coplanarity.linearised(slope, point, use)
+        _, square, b = coplanarity.linearise(f, point, use)
+        g, moved, turned = coplanarity.linearise(slope, point, use)
         weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
         bent = (
             coplanarity.condition(curve, point)
@@ -189,7 +189,7 @@ class Noise(NamedTuple):
     freedom: Float[Array, ""]
     expected: Bool[Array, ""]
 
-    def tolerated(self, squares: Float[Array, ""]) -> Float[Array, ""]:
+    def tolerance(self, squares: Float[Array, ""]) -> Float[Array, ""]:
         """Σ r² up to which another orientation fits as well as the one with Σ r² =
         squares."""
         more = CERTAIN**2 * self.freedom * self.size**2
@@ -199,7 +199,7 @@ class Noise(NamedTuple):
     def least_margin(self) -> Float[Array, ""]:
         """The `margin` below which a layout is not told from one that determines
         nothing."""
-        return jnp.where(self.expected, 4.0, required(self.freedom)) * self.size
+        return jnp.where(self.expected, 4.0, required_margin(self.freedom)) * self.size
 
 
 def noise(
@@ -214,7 +214,7 @@ def noise(
     return Noise(jnp.where(expected, unit, sigma0), freedom, expected)
 
 
-def required(freedom: Float[Array, ""]) -> Float[Array, ""]:
+def required_margin(freedom: Float[Array, ""]) -> Float[Array, ""]:
     """Multiple of sigma0 below which a `margin` is not told from measuring errors: 2,
     and more where sigma0 itself is uncertain, having few degrees of freedom (64 with
     one).
@@ -252,13 +252,13 @@ def excess(freedom: Float[Array, ""]) -> Float[Array, ""]:
     )
 
 
-def folded(
+def find_second(
     worst: WorstDirection, noise: Noise
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether there is a second minimum that fits as well, and whether nothing parts it
     from the first."""
     squares = jnp.where(noise.expected, 0.0, noise.freedom * noise.size**2)
-    fits = worst.rise < noise.tolerated(squares) - squares
+    fits = worst.rise < noise.tolerance(squares) - squares
     second = fits & (worst.turn < NEAR) & (noise.freedom > 0)
     return second, second & (worst.away < SEPARATE * noise.size)
 

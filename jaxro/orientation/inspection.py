@@ -52,7 +52,7 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
             None, rotation, base, point, *focals
         )
         left, right = (jnp.where(depth > 0, 1.0, -1.0) for depth in depths)
-        g, square, _ = coplanarity.linearised(f, point, use)
+        g, square, _ = coplanarity.linearise(f, point, use)
         length = rot.dot(first, first)
         # XLA gives a quotient that is used twice a loop of its own, but not a selection
         # of it

@@ -11,7 +11,7 @@ from ..adjustment.losses import AbstractLoss
 from ..adjustment.terms import Term
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose
-from ..geometry.pairs import Pair, cleaned, double
+from ..geometry.pairs import Pair, double, mask_unusable
 from ..xla.kernels import kernels_of_parts, one_kernel
 from ..xla.programs import Program, is_traced
 from ..xla.settings import COMPILE_FAST, COMPILE_FASTEST
@@ -55,8 +55,8 @@ def orient(
     """
     if pair.x_left.ndim != 1:
         raise ValueError(
-            f"orient takes one pair, but the coordinates have shape {pair.x_left.shape}: "
-            "use jax.vmap(orient), or orient_batch"
+            "orient takes one pair, but the coordinates have shape "
+            f"{pair.x_left.shape}: use jax.vmap(orient), or orient_batch"
         )
     problem = Problem(
         elements=elements,
@@ -92,7 +92,7 @@ def _run(function: Callable, pair: Pair, problem: Problem, kernel: Callable) -> 
 
 def orient_once(pair: Pair, problem: Problem) -> Orientation:
     """The orientation of one pair, within a compiled program."""
-    pair, bad_input = cleaned(pair)
+    pair, bad_input = mask_unusable(pair)
     solution = solve(pair, problem)
     description = describe(pair, problem, solution)
     return _conclude(pair, problem, solution, description, bad_input)
@@ -109,7 +109,7 @@ def orient_near(pair: Pair, problem: Problem) -> tuple[Orientation, Bool[Array, 
     vertical = starts.Vertical(steps=int(first_order))
     problem = problem.starting(vertical, max_steps=allowed)
 
-    pair, bad_input = cleaned(pair)
+    pair, bad_input = mask_unusable(pair)
     solution = solve(pair, problem)
     description = describe(pair, problem, solution)
     orientation = _conclude(pair, problem, solution, description, bad_input)

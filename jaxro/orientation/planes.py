@@ -25,7 +25,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from ..adjustment.normal_equations import accumulate, solve, steps
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..xla.kernels import while_loop
 from ..xla.passes import count
 from .inspection import inspect
@@ -104,7 +104,7 @@ def poses(pair: Pair, orientation: Oriented, *, limit: float = 4.0) -> PlanePose
     within the errors, and `behind` is zero for both, the points do not say which is
     right.
     """
-    pair, _ = cleaned(pair)
+    pair, _ = mask_unusable(pair)
     unit = limit * jnp.where(
         orientation.degrees_of_freedom > 0, orientation.sigma0, 1.0
     )
@@ -143,9 +143,8 @@ def second_squares(
 
     def once(state):
         needed, _ = state
-        inside = cleaned(pair.with_mask(pair.mask & needed))[
-            0
-        ]  # depends on the round, or it would not wait for it
+        # depends on the round, or it would not wait for it
+        inside = mask_unusable(pair.with_mask(pair.mask & needed))[0]
         other, exists = second(
             inside, pose, plane(inside, pose, inside.mask, jnp.inf).normal
         )
@@ -192,7 +191,7 @@ def plane(
     def error(point, sigma, normal):
         left, _ = rays(point)
         nearness = rot.dot(normal, left)
-        x, y, z = rot.apply(back, rot.shifted(left, base, -nearness))
+        x, y, z = rot.apply(back, rot.add_scaled(left, base, -nearness))
         safe = jnp.where(z < 0, z, -1.0)
         off = (pair.focal_right * x / -safe - point[2]) ** 2 + (
             pair.focal_right * y / -safe - point[3]
@@ -240,17 +239,18 @@ def twin(pose: RelativePose, normal: Float[Array, "3"]) -> Twin:
     first = tuple(
         tuple(e - b[i] * n[j] for j, e in enumerate(row)) for i, row in enumerate(eye)
     )
+    # A'⁻¹
     second = tuple(
         tuple(e + other[i] * w[j] / det for j, e in enumerate(row))
         for i, row in enumerate(eye)
-    )  # A'⁻¹
+    )
     turned = rot.product(rot.transpose(rot.product(first, second)), rotation)  # pyright: ignore[reportArgumentType]
     length = jnp.sqrt(rot.dot(other, other))  # pyright: ignore[reportArgumentType]
     there = there & (length > LEAST)
     length = jnp.where(there, length, 1.0)
     found = RelativePose(
         *rot.to_quaternion(turned), *(c / length for c in other)
-    ).normalised()
+    ).normalise()
     exists = there & jnp.isfinite(sum(jax.tree.leaves(found)))
     found = jax.tree.map(lambda a, b: jnp.where(exists, a, b), found, pose)
     return Twin(found, jnp.where(exists, jnp.stack(w) * length, normal), exists)
@@ -262,9 +262,9 @@ def refined(
     """The pose after some Gauss-Newton steps on the points in use, or unchanged where
     they fail."""
     residuals = coplanarity.residuals(pair.with_mask(pair.mask & use), pose)
-    moved = pose.moved(
+    moved = pose.move(
         steps(residuals, (jnp.zeros_like(pair.focal_left),) * 5, count, 0.3)
-    ).normalised()
+    ).normalise()
     fine = squares(pair.with_mask(use), moved) <= squares(pair.with_mask(use), pose)
     return jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved, pose)
 

@@ -12,7 +12,7 @@ from ..adjustment import critical_values
 from ..adjustment.guarded import root, times
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose
-from ..geometry.pairs import Coordinates, Pair, cleaned
+from ..geometry.pairs import Coordinates, Pair, mask_unusable
 from ..xla.programs import Program, is_traced
 from ..xla.settings import COMPILE_FAST, RUN_FAST
 from .results import RESULTS, is_usable
@@ -144,7 +144,7 @@ def _corrections_of(data: tuple[RelativePose, Pair]) -> Coordinates:
     if data[0].qw.ndim:
         return jax.vmap(_corrections_of)(data)
     pose, pair = data
-    pair, _ = cleaned(pair)
+    pair, _ = mask_unusable(pair)
     f = coplanarity.fundamental_matrix(
         *pose.relative(), pair.focal_left, pair.focal_right
     )

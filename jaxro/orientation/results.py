@@ -16,15 +16,12 @@ class RESULTS(results.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
     no_redundancy = (
         "Exactly five points: the elements are determined but nothing checks them, so "
-        "m_q and sigma0 do not exist. "
-        "Measure at least one more point."
+        "m_q and sigma0 do not exist. Measure at least one more point."
     )
     two_solutions = (
         "A second orientation fits the points as well, with all of them in front of "
-        "both photos: the points lie "
-        "(nearly) in one plane, or are too few. The better one is returned. Give an "
-        "approximate start, or measure "
-        "points off the plane."
+        "both photos: the points lie (nearly) in one plane, or are too few. The better "
+        "one is returned. Give an approximate start, or measure points off the plane."
     )
     too_few_points = (
         "Fewer than five usable points: relative orientation has five unknowns. "
@@ -32,43 +29,35 @@ class RESULTS(results.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     non_finite_input = (
         "A coordinate, standard deviation or focal length is NaN, infinite, out of all "
-        "proportion (a coordinate above "
-        "1e9 focal lengths) or not positive where it must be. The point was left out; "
-        "correct or mask it and orient "
-        "again."
+        "proportion (a coordinate above 1e9 focal lengths) or not positive where it "
+        "must be. The point was left out; correct or mask it and orient again."
     )
     weakly_determined = (
         "For its errors the layout determines the elements too weakly: one of them has "
-        "a standard deviation above 0.04 "
-        "rad (2°), or moving the points by a few sigma0 would leave one undetermined "
-        "(points near a line, in one "
-        "zone, or a needed zone empty). Add points far from the present ones, or look "
-        "for gross errors if sigma0 is "
-        "larger than you measure."
+        "a standard deviation above 0.04 rad (2°), or moving the points by a few "
+        "sigma0 would leave one undetermined (points near a line, in one zone, or a "
+        "needed zone empty). Add points far from the present ones, or look for gross "
+        "errors if sigma0 is larger than you measure."
     )
     zero_base = (
         "The photos are explained by a pure rotation: the base is zero (or every point "
-        "is far away), so neither base "
-        "direction nor model points exist. Use photos taken from different places."
+        "is far away), so neither base direction nor model points exist. Use photos "
+        "taken from different places."
     )
     points_behind_camera = (
         "At least one accurate point lies behind a photo: a wrong match, a sign error "
-        "in the coordinates, or a wrong "
-        "solution. `in_front` names the points."
+        "in the coordinates, or a wrong solution. `in_front` names the points."
     )
     photos_swapped = (
         "The right photo lies on the other side of the left one than the given base "
-        "says: "
-        "swap left and right, or give a negative base."
+        "says: swap left and right, or give a negative base."
     )
     elements_undefined = (
         "The chosen elements do not exist here, or have standard deviations above 0.04 "
-        "rad (2°) where the pose has "
-        "not: the base is nearly at right angles to the x axis (or along the photo "
-        "axis), or a photo turned by 90°; or "
-        "the given base is no length: 0, not finite, or negative for "
-        "IndependentElements. Give another base, or use "
-        "RelativePose, which exists for every position."
+        "rad (2°) where the pose has not: the base is nearly at right angles to the x "
+        "axis (or along the photo axis), or a photo turned by 90°; or the given base "
+        "is no length: 0, not finite, or negative for IndependentElements. Give "
+        "another base, or use RelativePose, which exists for every position."
     )
 
 

@@ -37,7 +37,7 @@ def verdict(
     direction = degeneracy.worst_direction(
         pair, adjustment.parameters, adjustment.cofactor
     )
-    second, undivided = degeneracy.folded(direction, noise)
+    second, undivided = degeneracy.find_second(direction, noise)
     twin = _twin_fits(pair, solution, description)
     rotation = degeneracy.pure_rotation(
         description.inspection, noise.freedom, description.sigma0
@@ -53,7 +53,7 @@ def verdict(
         ),
         (
             RESULTS.elements_undefined,
-            solved & _elements_undefined(problem, description, weakest),
+            solved & _lack_elements(problem, description, weakest),
         ),
         (
             RESULTS.photos_swapped,
@@ -85,7 +85,7 @@ def _is_weak(
     return deviates | (direction.margin < noise.least_margin)
 
 
-def _elements_undefined(
+def _lack_elements(
     problem: Problem, description: Description, weakest: Float[Array, ""]
 ) -> Bool[Array, ""]:
     """Whether the elements that were asked for do not exist at the pose, or are far
@@ -114,4 +114,4 @@ def _twin_fits(
     sigma = jnp.where(inspection.sigma > 0, inspection.sigma, 1.0)
     rounding = planes.ROUNDING * pair.count * (pair.focal_left / sigma) ** 2
     best = noise.freedom * description.sigma0**2
-    return squares <= noise.tolerated(best) + rounding
+    return squares <= noise.tolerance(best) + rounding

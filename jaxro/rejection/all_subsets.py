@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ..adjustment import critical_values
 from ..adjustment.normal_equations import SINGULAR, accumulate, cholesky, substitute
 from ..geometry.linear import Linear, linearised
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import orient
 from ..orientation.starts import AbstractStart, Vertical
 from ..xla.passes import count, total
@@ -56,7 +56,7 @@ class AllSubsets(AbstractProcedure):
     start: AbstractStart = Vertical()
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = scaled(cleaned(pair)[0], self.sigma)
+        pair = scaled(mask_unusable(pair)[0], self.sigma)
         n = pair.x_left.shape[0]
         most = min(self.most, max(n - self.least, 0))
         while sum(comb(n, k) for k in range(most + 1)) > CHOICES:

@@ -288,7 +288,7 @@ def iterated(
 ) -> AbstractElements:
     """The elements after one iteration of the strict solution."""
     zero = (jnp.zeros_like(pair.focal_left),) * 5
-    return elements.moved(
+    return elements.move(
         steps(residuals_at(pair, mask, elements), zero, 1, float("inf"))
     )
 

@@ -8,7 +8,7 @@ from ..assessment.correlations import Normalised, normalised
 from ..assessment.familywise import largest_tau, largest_w
 from ..assessment.undecided import DOUBT, misfit
 from ..geometry.linear import linearised
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import orient
 from ..orientation.starts import AbstractStart, Vertical
 from ..xla.passes import count
@@ -50,7 +50,7 @@ class DataSnooping(AbstractProcedure):
     doubt: float = DOUBT
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = scaled(cleaned(pair)[0], self.sigma)
+        pair = scaled(mask_unusable(pair)[0], self.sigma)
         pose = self.start(
             lax.stop_gradient(pair)
         ).pose  # the optimum does not depend on where it is sought

@@ -13,7 +13,7 @@ rejects good points in place of wrong ones in table 1 of the paper.
 import jax.numpy as jnp
 
 from ..geometry.elements import AbstractElements
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..xla.kernels import while_loop
 from ..xla.passes import count
 from .base import (
@@ -67,7 +67,7 @@ class Dorozhinsky(AbstractProcedure):
     least: int = 6
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = cleaned(pair)[0]
+        pair = mask_unusable(pair)[0]
         zero = zero_elements(pair)
         cycles = max(pair.x_left.shape[0] - self.least, 0) + 1
         history = began(pair, 1 + cycles * (self.corrections + 1) + CONVERGENCE + 1)

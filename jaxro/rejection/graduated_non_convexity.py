@@ -7,7 +7,7 @@ from jax import lax
 
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearised
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.starts import AbstractStart, Vertical
 from .base import Rejection
 from .robust import AbstractSearch, agreeing, in_single, judged, reweighted, scaled
@@ -33,7 +33,7 @@ class GraduatedNonConvexity(AbstractSearch):
     start: AbstractStart = Vertical(steps=0)
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = scaled(cleaned(pair)[0], self.sigma)
+        pair = scaled(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = self.search(fixed)
         use = fixed.mask & (linearised(fixed, pose).squares <= self.limit**2)
@@ -56,6 +56,4 @@ class GraduatedNonConvexity(AbstractSearch):
         pose = in_single(self.start(pair).pose)
         pose = lax.fori_loop(0, self.absolute, absolute, pose)
         pose = lax.fori_loop(0, self.graded, graded, pose)
-        return jax.tree.map(
-            lambda a: a.astype(pair.focal_left.dtype), pose
-        ).normalised()
+        return jax.tree.map(lambda a: a.astype(pair.focal_left.dtype), pose).normalise()

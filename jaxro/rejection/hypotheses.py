@@ -155,13 +155,13 @@ def refined(
 
     def step(_, pose: RelativePose):
         *n, (*h, _) = computed_once(normal)(computed_once(rows)(pose))
-        return pose.moved(tuple(-d for d in solve(n, h)))
+        return pose.move(tuple(-d for d in solve(n, h)))
 
     pose = lax.fori_loop(0, steps, step, jax.tree.map(single, pose))
     fine = jnp.isfinite(sum(jax.tree.leaves(pose)))
     return jax.tree.map(
         lambda a: jnp.where(fine, a, one).astype(subset.focal_left.dtype), pose
-    ).normalised(), fine
+    ).normalise(), fine
 
 
 def draws(

@@ -7,7 +7,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry.elements import RelativePose, vertical
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..xla.passes import count, total
 from .base import Rejection
 from .hypotheses import (
@@ -48,7 +48,7 @@ class LeastMedian(AbstractSearch):
     seed: int = 0
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = cleaned(pair)[0]
+        pair = mask_unusable(pair)[0]
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose, median = self._found(fixed)
         unit = (

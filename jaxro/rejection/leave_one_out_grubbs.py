@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from ..adjustment import critical_values
 from ..adjustment.normal_equations import accumulate, cholesky, substitute
 from ..geometry.elements import AbstractElements
-from ..geometry.mock_pairs import noisy, planted
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.mock_pairs import noisy, plant
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import orient
 from ..xla.kernels import computed_once
 from ..xla.passes import count, sums, total
@@ -143,7 +143,7 @@ class LeaveOneOutGrubbs(AbstractProcedure):
     critical: Float[Array, "count"] | None = None
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = cleaned(pair)[0]
+        pair = mask_unusable(pair)[0]
 
         def judge(mask, history):
             solved = by_parallax(pair, mask)
@@ -197,12 +197,10 @@ def calibrated(
     depend on their size. For the rounds after a rejection as many random points are
     left out. Numbers of points beyond `rounds` use the formula.
     """
-    pair = cleaned(pair)[0]
+    pair = mask_unusable(pair)[0]
     solved = orient(pair)
     x_left, y_left, x_right, y_right = solved.corrections(pair)
-    exact = planted(
-        pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right
-    )
+    exact = plant(pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right)
     size = 1e-5 * pair.focal_left
     used = int(count(pair.mask))
     table = jnp.zeros(pair.x_left.shape[0] + 1)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from ..adjustment import critical_values
 from ..geometry.elements import RelativePose, vertical
 from ..geometry.linear import linearised
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..xla.kernels import while_loop
 from ..xla.passes import count, total
 from .base import Rejection
@@ -68,7 +68,7 @@ class Ransac(AbstractSearch):
     sigma: float | None = None
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = scaled(cleaned(pair)[0], self.sigma)
+        pair = scaled(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = self.search(fixed)
         each = lambda n: critical_values.normal(self.level / jnp.maximum(n, 1.0))

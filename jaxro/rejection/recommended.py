@@ -25,7 +25,7 @@ from ..adjustment import critical_values
 from ..assessment.undecided import undecided
 from ..geometry.elements import RelativePose, vertical
 from ..geometry.linear import linearised
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..xla.kernels import if_needed
 from ..xla.passes import count, total
 from . import evidence
@@ -114,7 +114,7 @@ class Recommended(AbstractProcedure):
     known: bool = True
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = scaled(cleaned(pair)[0], self.sigma)
+        pair = scaled(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         begin = jnp.ones_like(pair.focal_left) if self.known else _unit(fixed)
         fixed = rescaled(fixed, begin)
@@ -198,5 +198,7 @@ def _where_open(
     stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision
 ) -> Decision:
     """The decision of a stage where there is none yet."""
-    decide = lambda open_: stage(cleaned(pair.with_mask(pair.mask & open_))[0], limit)
+    decide = lambda open_: stage(
+        mask_unusable(pair.with_mask(pair.mask & open_))[0], limit
+    )
     return if_needed(~before.believed, decide, before)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from ..adjustment.losses import AbstractWeight, Huber, Tukey
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearised
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.starts import AbstractStart, Vertical
 from ..xla.kernels import while_loop
 from ..xla.passes import count
@@ -50,7 +50,7 @@ class Reweighting(AbstractSearch):
     start: AbstractStart = Vertical()
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = scaled(cleaned(pair)[0], self.sigma)
+        pair = scaled(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         rests, pose, share = self._solved(fixed)
         w = normalised(linearised(fixed, pose), share)

@@ -95,10 +95,10 @@ def stepped(
         1.0, most / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny)
     )
     shrink = jnp.where(jnp.isfinite(longest), shrink, 0.0)
-    moved = pose.moved(
+    moved = pose.move(
         tuple(jnp.where(jnp.isfinite(d), -shrink * d, 0.0) for d in delta)
     )
-    return moved.normalised()
+    return moved.normalise()
 
 
 def reweighted(

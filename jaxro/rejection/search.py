@@ -283,7 +283,7 @@ def _gathered(
     fine = there & jnp.isfinite(sum(jax.tree.leaves(pose)))
     one = jnp.ones_like(pose.qw)
     pose = jax.tree.map(lambda a: jnp.where(fine, a, one), pose)
-    return jax.vmap(lambda pose: pose.normalised())(pose), fine
+    return jax.vmap(lambda pose: pose.normalise())(pose), fine
 
 
 def _pose(rotation: Float[Array, "3 3"], base: Float[Array, "3"]) -> RelativePose:
@@ -312,7 +312,7 @@ def _judged(
     f = jax.tree.map(single, jax.vmap(fundamental)(poses))
 
     def one(f, point, use):
-        g, square, _ = coplanarity.linearised(f, point, use)
+        g, square, _ = coplanarity.linearise(f, point, use)
         return g * g / square
 
     each = jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, 0))

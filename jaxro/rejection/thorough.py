@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry.elements import RelativePose
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..orientation import planes
 from ..xla.kernels import if_needed, while_loop
 from ..xla.passes import count, total
@@ -97,7 +97,7 @@ class Thorough(AbstractStage):
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         again, key = evidence.repeats(pair)
-        once = cleaned(pair.with_mask(pair.mask & ~again))[0]
+        once = mask_unusable(pair.with_mask(pair.mask & ~again))[0]
         found, scale = self._searched(once, self._near_vertical(once), limit)
         once = rescaled(once, scale)
         pose, use = _of_both_poses(once, *settled(once, found.pose, limit), limit)
@@ -182,7 +182,9 @@ class Thorough(AbstractStage):
 
     def _near_vertical(self, pair: Pair) -> RelativePose:
         """The best orientation of those that begin at the vertical."""
-        small = cleaned(pair.with_mask(pair.mask & (count(pair.mask) <= self.few)))[0]
+        small = mask_unusable(
+            pair.with_mask(pair.mask & (count(pair.mask) <= self.few))
+        )[0]
         best = from_vertical(pair, 8)
         for other in (self.graduated.search(pair), self.near.search(small)):
             better = score(pair, other, self.search.limit) < score(

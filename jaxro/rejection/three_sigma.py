@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from .base import (
     OUTCOMES,
     AbstractProcedure,
@@ -31,7 +31,7 @@ class ThreeSigma(AbstractProcedure):
     least: int = 6
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = cleaned(pair)[0]
+        pair = mask_unusable(pair)[0]
         first = by_parallax(pair, pair.mask)
         q = jnp.abs(first.parallax)
         limit = self.factor * first.m_q

@@ -3,7 +3,7 @@ again."""
 
 import jax.numpy as jnp
 
-from ..geometry.pairs import Pair, cleaned
+from ..geometry.pairs import Pair, mask_unusable
 from ..xla.passes import count
 from .base import (
     OUTCOMES,
@@ -34,7 +34,7 @@ class WorstPoint(AbstractProcedure):
     least: int = 6
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = cleaned(pair)[0]
+        pair = mask_unusable(pair)[0]
         enough = pair.count > self.more_than
 
         def judge(mask, history):

@@ -22,7 +22,7 @@ from ..assessment.reliability import Reliability, assess
 from ..geometry import rotations as rot
 from ..geometry.elements import AbstractElements, DependentElements, RelativePose
 from ..geometry.linear import Linear, linearised
-from ..geometry.pairs import Camera, Coordinates, Pair, cleaned
+from ..geometry.pairs import Camera, Coordinates, Pair, mask_unusable
 from ..orientation.result import Orientation
 from ..orientation.results import RESULTS
 from ..tables.csv import Measurements
@@ -112,7 +112,7 @@ def _told(read: tuple[Pair, Orientation], *, reliable: bool, sigma0) -> tuple:
     elements = element_values(o.elements, o.cofactor, o.sigma0)
     if not reliable:
         return o.corrections(pair), elements, None, None
-    used = cleaned(pair)[0]
+    used = mask_unusable(pair)[0]
     conditions = linearised(used, o.pose), used.coordinates
     return o.corrections(pair), elements, assess(pair, o, sigma0=sigma0), conditions
 
@@ -254,7 +254,7 @@ def element_values(
         )
 
     def values(*step: Array) -> tuple[Array, ...]:
-        rotation, base = found.moved(step).relative()
+        rotation, base = found.move(step).relative()
         return (*base, *rot.omega_phi_kappa(rot.transpose(rotation)))
 
     zero = (jnp.zeros_like(sigma0),) * 5

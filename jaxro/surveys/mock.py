@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from ..geometry import rotations as rot
-from ..geometry.mock_pairs import projected
+from ..geometry.mock_pairs import project
 from .survey import Measured, Survey, survey
 
 
@@ -69,7 +69,7 @@ def photo(
     station = middle[0] + (side - 0.5) * scene.base
 
     def one(x, y, z):
-        u, v = projected(
+        u, v = project(
             rotation, (x - station, y - middle[1], z - scene.camera_height), scene.focal
         )
         bent = 1 + scene.distortion / 20**3 * (u * u + v * v)

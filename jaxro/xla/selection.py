@@ -50,9 +50,8 @@ def _some(
     time."""
     size = needed.shape[0]
     place = jnp.where(needed, jnp.cumsum(needed) - 1, size)
-    order = (
-        jnp.full(size, size).at[place].set(jnp.arange(size), mode="drop")
-    )  # behind the last one a row that is none
+    # behind the last one a row that is none
+    order = jnp.full(size, size).at[place].set(jnp.arange(size), mode="drop")
     total = jnp.sum(needed)
 
     def turn(state: tuple[Array, PyTree]) -> tuple[Array, PyTree]:

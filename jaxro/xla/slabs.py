@@ -73,9 +73,8 @@ def spread(
         )
     leaves = jax.tree.leaves(data)
     total, points = leaves[0].shape[0], math.prod(leaves[0].shape[1:])
-    devices = (
-        jax.local_devices()
-    )  # several GPUs take turns; a CPU is one, whose cores are the threads
+    # several GPUs take turns; a CPU is one, whose cores are the threads
+    devices = jax.local_devices()
     cores = _count_workers()
     if split.slab is not None:
         size = -(-split.slab // chunk) * chunk
@@ -84,9 +83,8 @@ def spread(
     else:
         most = max(1, SLAB_POINTS // (chunk * max(points, 1)))
         calls = max(split.calls * cores, -(-total // (most * chunk)), 1)
-        calls = (
-            -(-calls // cores) * cores if calls > 1 else 1
-        )  # so that no core waits for the last call
+        # so that no core waits for the last call
+        calls = -(-calls // cores) * cores if calls > 1 else 1
         size = chunk * min(most, _round_up(-(-total // (calls * chunk))))
     begins = range(0, total, size)
 
@@ -168,9 +166,8 @@ def _share_out(
     try:
         go(notify)
     finally:
-        others = [
-            other for other in others if not other.cancel()
-        ]  # who has not begun by now has nothing to do
+        # who has not begun by now has nothing to do
+        others = [other for other in others if not other.cancel()]
         wait(others)
     for other in others:
         other.result()

@@ -340,7 +340,7 @@ def test_a_pair_as_one_of_several_terms_is_the_pair():
         jax.tree.map(lambda a: a[:2], alone.pose),
         jnp.array([0.02, -0.01, 0.01, 0.02, -0.02]),
     )
-    near = jax.vmap(lambda pose: pose.moved(tuple(off)).normalised())(start)
+    near = jax.vmap(lambda pose: pose.move(tuple(off)).normalise())(start)
     found = eqx.filter_jit(adjust)(term, {"pose": near})
     for one, other in zip(
         jax.tree.leaves(found.parameters["pose"]),

@@ -175,7 +175,7 @@ def test_after_cleaning_tells_what_a_procedure_is_worth():
     any the region holds 95 %."""
     procedure = rejection.DataSnooping()
     clean = jax.tree.map(lambda a: a[0], measured(1, 16))
-    wrong = mock_pairs.planted(clean, y_right=jnp.zeros(16).at[5].set(0.4))
+    wrong = mock_pairs.plant(clean, y_right=jnp.zeros(16).at[5].set(0.4))
     for pair, largest, least, most in (
         (wrong, None, 0.8, 1.0),
         (wrong, 0.03, 0.0, 0.5),

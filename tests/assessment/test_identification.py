@@ -172,7 +172,7 @@ def cleaned(points, size, trials, procedure=SNOOPING, layout=layout):
 def test_where_nothing_tells_the_points_apart_none_is_rejected():
     """An error in one of the four points that stand alone in their zones: all four are
     named, and no other."""
-    flat = jaxro.pad(mock_pairs.planted(exact(8), y_right=np.eye(8)[0] * 0.4), 10)
+    flat = jaxro.pad(mock_pairs.plant(exact(8), y_right=np.eye(8)[0] * 0.4), 10)
     found = problems.jit(SNOOPING)(flat)
     assert list(np.flatnonzero(found.undecided) + 1) == [1, 2, 5, 6]
     assert (
@@ -180,9 +180,7 @@ def test_where_nothing_tells_the_points_apart_none_is_rejected():
         and found.outcome == OUTCOMES.undecided
         and OUTCOMES[found.outcome]
     )
-    six = problems.jit(SNOOPING)(
-        mock_pairs.planted(exact(6), y_right=np.eye(6)[2] * 0.4)
-    )
+    six = problems.jit(SNOOPING)(mock_pairs.plant(exact(6), y_right=np.eye(6)[2] * 0.4))
     assert np.all(six.undecided) and np.all(six.mask)
 
 
@@ -234,7 +232,7 @@ def test_the_minimal_identifiable_error_is_identified_with_its_power(points, tri
     assert np.all(np.asarray(told.identified) > float(told.found) - 1e-9)
     for point in (0, 6):
         error = float(told.identifiable[3][point]) * (np.arange(points) == point)
-        noise = lambda key, error=error: mock_pairs.planted(
+        noise = lambda key, error=error: mock_pairs.plant(
             mock_pairs.noisy(one, key, SIGMA), y_right=error
         )
         pairs = jax.vmap(noise)(jax.random.split(jax.random.key(100 + point), trials))

@@ -223,7 +223,7 @@ def test_an_error_of_the_detectable_size_moves_its_test_by_delta0():
     @problems.jit
     @jax.vmap
     def tested(size, point):
-        bad = mock_pairs.planted(
+        bad = mock_pairs.plant(
             plan.pair, y_right=jnp.where(jnp.arange(9) == point, size, 0.0)
         )
         solved = jaxro.orient(bad, start=starts.Vertical())

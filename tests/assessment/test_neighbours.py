@@ -51,7 +51,7 @@ def programs():
 
     def solved(place, errors):
         names = ("x_left", "y_left", "x_right", "y_right")
-        pair = mock_pairs.planted(ideal(place), **dict(zip(names, errors, strict=True)))
+        pair = mock_pairs.plant(ideal(place), **dict(zip(names, errors, strict=True)))
         pose = jax.lax.fori_loop(
             0, 4, lambda _, p: improved(pair, p, pair.mask), jaxro.to_pose(elements)
         )
@@ -130,7 +130,7 @@ def test_probability_is_that_of_a_simulation():
     place = places(40, False, 1, rng)
     errors = correlated_errors(ideal(place), 0.4, 20.0, rng)[0]
     pair = jax.tree.map(lambda a: a[0], ideal(place))
-    pair = mock_pairs.planted(
+    pair = mock_pairs.plant(
         pair, x_left=errors[0], y_left=errors[1], x_right=errors[2], y_right=errors[3]
     )
     photo = jaxro.orient(pair)

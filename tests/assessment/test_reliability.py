@@ -235,7 +235,7 @@ def test_effect_on_m_q_with_errors_present(elements):
         error = np.zeros(16)
         error[point] = float(reading.detectable[3][point])
         larger = max(
-            float(oriented(mock_pairs.planted(one, y_right=s * error)).m_q)
+            float(oriented(mock_pairs.plant(one, y_right=s * error)).m_q)
             for s in (1, -1)
         )
         np.testing.assert_allclose(
@@ -469,7 +469,7 @@ def trial():
         error = [
             jnp.where(here & (coordinate == k), detectable[k], 0.0) for k in range(4)
         ]
-        wrong = mock_pairs.planted(measured, **dict(zip(NAMES, error, strict=True)))
+        wrong = mock_pairs.plant(measured, **dict(zip(NAMES, error, strict=True)))
 
         def shown(one):
             found = orient(one, elements=IndependentElements, base=BASE, start=true)

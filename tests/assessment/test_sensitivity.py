@@ -52,7 +52,7 @@ def everything(orientation):
 def cases():
     """Residuals of three times the usual size; a point 100 sigma off; points that are
     all the same. Two places are empty, and hold NaN."""
-    bad = mock_pairs.planted(
+    bad = mock_pairs.plant(
         problems.tilted(SIGMA),
         y_right=np.where(np.arange(POINTS) == 6, 100 * SIGMA, 0.0),
     )
@@ -238,13 +238,13 @@ def test_second_order_term():
 def test_elements_of_a_pose_are_its_local_parameters():
     """`displacement` is the inverse of `moved`, and its derivative is not zero."""
     rng = np.random.default_rng(1)
-    pose = RelativePose(*jnp.asarray(rng.normal(size=7))).normalised()
+    pose = RelativePose(*jnp.asarray(rng.normal(size=7))).normalise()
     step = tuple(jnp.asarray(rng.normal(size=5) * 0.3))
-    there = lambda step: sensitivity.displacement(pose, pose.moved(step).normalised())
+    there = lambda step: sensitivity.displacement(pose, pose.move(step).normalise())
     np.testing.assert_allclose(there(step), np.array(step), atol=1e-14)
     named = IndependentElements(*jnp.asarray(rng.normal(size=5)))
     np.testing.assert_allclose(
-        sensitivity.displacement(named, named.moved(step)), np.array(step), atol=1e-14
+        sensitivity.displacement(named, named.move(step)), np.array(step), atol=1e-14
     )
 
 

@@ -30,7 +30,7 @@ def program():
     def one(clean, true, key, sigma):
         errors = sigma * jax.random.normal(key, (4, 16), float)
         names = ("x_left", "y_left", "x_right", "y_right")
-        measured = mock_pairs.planted(clean, **dict(zip(names, errors, strict=True)))
+        measured = mock_pairs.plant(clean, **dict(zip(names, errors, strict=True)))
         return measured, orient(
             measured, elements=IndependentElements, base=BASE, start=true
         )

@@ -184,7 +184,9 @@ def test_one_kernel_gives_what_many_give(pairs, kernel):
     options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
     few = jax.tree.map(lambda a: a[:96], pairs)
     programs = [
-        Program(batch._slab_near, options, RUN_FAST | UNSPLIT_LOOPS, kernel=kernel)
+        Program(
+            batch._orient_slab_near, options, RUN_FAST | UNSPLIT_LOOPS, kernel=kernel
+        )
         for kernel in (kernel, None)
     ]
     (one, fits), (many, again) = (
@@ -221,7 +223,7 @@ def test_results_of_points_are_one_loop_each(pairs):
     host = jax.tree.map(np.asarray, pairs)
     options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
     run = jax.jit(
-        lambda data: one_kernel_fusing_points(batch._slab_near)(data, **options),
+        lambda data: one_kernel_fusing_points(batch._orient_slab_near)(data, **options),
         compiler_options=known_settings(RUN_FAST | UNSPLIT_LOOPS | NO_LIBRARY_SUMS),
     )
     compiled = run.lower(jax.tree.map(lambda a: a[:96], host)).compile().as_text()

@@ -117,7 +117,7 @@ def test_what_is_no_list_of_pairs_is_refused(pairs):
 
 def test_what_would_leave_results_unwritten_is_refused(together):
     near = {"plan": PLAN, "start": jaxro.starts.Vertical()}
-    short = padding.planned(np.array([8]))
+    short = padding.plan_for(np.array([8]))
     with pytest.raises(ValueError, match=r"up to 8 points, but pair 3 has 12"):
         ragged.orient_ragged(together, plan=short)
     with pytest.raises(ValueError, match=r"up to 8 points, but pair 3 has 12"):

@@ -165,7 +165,7 @@ def table_1(points):
     flat = mock_pairs.mock_pair(mock_pairs.standard_layout(points))
     errors = np.array([0, 0, 0, 0, 0, 0, 2.0, 2.2, -2.43, -1.90])[:points]
     columns = np.stack(
-        [np.asarray(c) for c in mock_pairs.planted(flat, y_right=errors).coordinates],
+        [np.asarray(c) for c in mock_pairs.plant(flat, y_right=errors).coordinates],
         axis=-1,
     )
     return [
@@ -357,7 +357,7 @@ def test_every_outcome_has_a_name_and_advice():
 def test_points_that_nothing_tells_apart_are_named(tmp_path):
     """An error in one of four points that stand alone in their zones: in the report,
     the tables and the summary."""
-    flat = mock_pairs.planted(
+    flat = mock_pairs.plant(
         mock_pairs.mock_pair(mock_pairs.standard_layout(8)), y_right=np.eye(8)[0] * 0.4
     )
     columns = np.stack([np.asarray(c) for c in flat.coordinates], axis=-1)

@@ -27,7 +27,7 @@ from jaxro.experiments import (
 from jaxro.experiments.calibration import adjustable, calibrated
 from jaxro.experiments.compare import Setting
 from jaxro.geometry import mock_pairs
-from jaxro.geometry.pairs import cleaned
+from jaxro.geometry.pairs import mask_unusable
 from jaxro.rejection import PROCEDURES, AbstractProcedure, Rejection
 from jaxro.rejection.base import (
     Round,
@@ -72,7 +72,7 @@ class Informed(AbstractProcedure):
     limit: float | Float[Array, ""]
 
     def __call__(self, pair) -> Rejection:
-        pair = cleaned(pair)[0]
+        pair = mask_unusable(pair)[0]
         off = jnp.abs(pair.y_right - EXACT.y_right)
         bad = pair.mask & (off > self.limit)
         solved = by_parallax(pair, pair.mask & ~bad)

@@ -12,7 +12,7 @@ from jaxro.geometry import mock_pairs
 from jaxro.geometry.mock_pairs import (
     mock_pair,
     noisy,
-    planted,
+    plant,
     random_pairs,
     relief,
     row_layout,
@@ -108,7 +108,7 @@ def test_noise_is_seeded_and_has_its_sigma():
 
 def test_planted_errors_go_where_they_are_sent():
     flat = mock_pair(standard_layout(8)).with_mask(jnp.arange(8) < 7)
-    wrong = planted(flat, y_right=np.array([0, 0, 0, 0, 0, 0, 1.5, 2.0]), x_left=0.1)
+    wrong = plant(flat, y_right=np.array([0, 0, 0, 0, 0, 0, 1.5, 2.0]), x_left=0.1)
     np.testing.assert_allclose(
         wrong.y_right - flat.y_right, [0, 0, 0, 0, 0, 0, 1.5, 0], atol=1e-14
     )

@@ -508,7 +508,7 @@ def test_slopes_are_derivatives_along_further_steps(system):
         )
 
     def after(*step):
-        return directions(*centre.moved(centre.further(x, step)).relative())
+        return directions(*centre.move(centre.further(x, step)).relative())
 
     value, slopes = centre.slopes(directions, x)
     np.testing.assert_allclose(value, after(*jnp.zeros(5)), atol=1e-14)

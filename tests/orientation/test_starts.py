@@ -14,7 +14,7 @@ import jaxro
 from jaxro.geometry import coplanarity, rotations as rot
 from jaxro.geometry.elements import IndependentElements, vertical
 from jaxro.orientation.starts import SixPoints, decomposition, six_points
-from jaxro.orientation.starts.base import FirstOrder, approached
+from jaxro.orientation.starts.base import FirstOrder, approach
 from jaxro.orientation.starts.eight_point import eight_point
 from jaxro.orientation.starts.five_point import five_point
 from jaxro.orientation.starts.null_space import null_space
@@ -405,7 +405,7 @@ def test_first_order_equations_are_the_condition_at_zero_elements():
 
     def condition(x):
         f = coplanarity.fundamental_matrix(
-            *vertical(focals[0]).moved(x).relative(), *focals
+            *vertical(focals[0]).move(x).relative(), *focals
         )
         return jax.vmap(lambda point: coplanarity.condition(f, point))(
             wide.coordinates
@@ -419,7 +419,7 @@ def test_first_order_equations_are_the_condition_at_zero_elements():
     )
     truth = jaxro.orient(pair).pose.quaternion
     vertical_error, first, second = (
-        float(jnp.max(jnp.abs(approached(pair, count).quaternion - truth)))
+        float(jnp.max(jnp.abs(approach(pair, count).quaternion - truth)))
         for count in range(3)
     )
     assert first < vertical_error**2 and second < 1e-4 * vertical_error

@@ -196,9 +196,7 @@ def test_first_order_distribution_of_one_error(zones, wrong, exact):
         tuple(x for x, _ in places), tuple(y for _, y in places), zones
     )
     small = 1e-5 * (np.arange(len(zones)) == wrong)
-    found = by_parallax(
-        mock_pairs.planted(mock_pairs.mock_pair(layout), y_right=-small)
-    )
+    found = by_parallax(mock_pairs.plant(mock_pairs.mock_pair(layout), y_right=-small))
     np.testing.assert_allclose(36e5 * found.parallax, exact, atol=0.006)
 
 

@@ -101,9 +101,7 @@ def random_pair(key, layout):
         keys[4],
         jnp.where(wrong, size * jax.random.rademacher(keys[5], (n,), float), 0.0),
     )
-    measured = mock_pairs.planted(
-        mock_pairs.noisy(exact, keys[6], 0.01), y_right=errors
-    )
+    measured = mock_pairs.plant(mock_pairs.noisy(exact, keys[6], 0.01), y_right=errors)
     lacking = jax.random.uniform(keys[7], (n,), float) < jax.random.uniform(
         keys[8], (), float, -1.5, 1.0
     )
@@ -240,7 +238,7 @@ def test_log_is_table_2_and_the_operator_is_asked_for():
             and not np.any(log.rejected[row])
         )
     # six points, one of them wrong: no point can go
-    flat = mock_pairs.planted(
+    flat = mock_pairs.plant(
         mock_pairs.mock_pair(mock_pairs.standard_layout(6)),
         y_right=3.0 * (np.arange(6) == 2),
     )
@@ -300,7 +298,7 @@ def test_three_m_q_rejects_nothing_up_to_sixteen_points():
         assert np.max(redundancy) * (n - 5) < 9, name
     errors = 0.5 * np.eye(16)
     pairs = jaxro.stack(
-        [mock_pairs.planted(mock_pairs.mock_pair(ROWS), y_right=row) for row in errors]
+        [mock_pairs.plant(mock_pairs.mock_pair(ROWS), y_right=row) for row in errors]
     )
     mask, _, _ = decided(PROCEDURES["three-sigma"], pairs)
     assert np.all(np.sum(mask, axis=1) == 16)
@@ -331,7 +329,7 @@ def test_first_algorithm_rejects_the_good_neighbour():
         tuple(y for _, y in places),
         (1, 2, 3, 4, 5, 6, 3, 2, 4, 5),
     )
-    example = mock_pairs.planted(
+    example = mock_pairs.plant(
         mock_pairs.mock_pair(layout), y_right=2.0 * (np.arange(10) == 6)
     )
     _, order, log = decided(PROCEDURES["mean-parallax"], jaxro.stack([example]))
@@ -360,7 +358,7 @@ def test_the_only_point_of_a_zone_is_never_judged():
         tuple(x for x, _ in places), tuple(y for _, y in places), zones
     )
     errors = np.array([0, 0, 0, 0, 2.0, 0.1, 0, 0, 0, 0])
-    exact = mock_pairs.planted(mock_pairs.mock_pair(layout), y_right=errors)
+    exact = mock_pairs.plant(mock_pairs.mock_pair(layout), y_right=errors)
     pairs = jax.vmap(lambda key: mock_pairs.noisy(exact, key, 0.003))(
         jax.random.split(jax.random.key(4), BATCH)
     )
@@ -424,7 +422,7 @@ def suspicious():
     """Sixteen points of which two are wrong and two, masked, hold anything."""
     tilted = problems.tilted(sigma=0.003)
     mask = ~np.isin(np.arange(16), (2, 9))
-    measured = mock_pairs.planted(
+    measured = mock_pairs.plant(
         tilted, y_right=1.5 * (np.arange(16) == 5) - 0.4 * (np.arange(16) == 12)
     )
     whole = pair(

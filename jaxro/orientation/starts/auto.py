@@ -9,7 +9,7 @@ from ...geometry.elements import RelativePose
 from ...geometry.pairs import Pair
 from ...xla.kernels import while_loop
 from ..inspection import Inspection, inspect
-from .base import AbstractStart, StartingPose, approached
+from .base import AbstractStart, StartingPose, approach
 from .general import General
 
 
@@ -45,7 +45,7 @@ class Auto(AbstractStart):
         )
 
     def __call__(self, pair: Pair) -> StartingPose:
-        near = approached(pair, self.steps)
+        near = approach(pair, self.steps)
         fits = self.fits(near, inspect(pair, near))
 
         # A loop of at most one round: under vmap it is entered only if some pair of the

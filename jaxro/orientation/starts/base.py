@@ -62,10 +62,11 @@ class FirstOrder(NamedTuple):
         """g at zero elements, its five slopes, and the weights of the points."""
         del at
         pair = self.pair
+        # one division each: a point's would cost as much again
         left, right = (
             1 / pair.focal_left,
             1 / pair.focal_right,
-        )  # one division each: a point's would cost as much again
+        )
         x, y, u, v = (
             pair.x_left * left,
             pair.y_left * left,
@@ -86,7 +87,7 @@ class FirstOrder(NamedTuple):
         return tuple(a + b for a, b in zip(x, step, strict=True))
 
 
-def approached(pair: Pair, count: int) -> RelativePose:
+def approach(pair: Pair, count: int) -> RelativePose:
     """The pose some Gauss-Newton steps from the vertical, which stays where they fail.
 
     The first is by the first-order equations, a third of the work; the others are in
@@ -96,20 +97,20 @@ def approached(pair: Pair, count: int) -> RelativePose:
     if count == 0:
         return pose
     zero = (jnp.zeros_like(pair.focal_left),) * 5
-    near = _moved(pose, normal.steps(FirstOrder(pair), zero, 1, LONGEST))
+    near = _take_step(pose, normal.steps(FirstOrder(pair), zero, 1, LONGEST))
     if count == 1:
         return near
     single, points = _with_dtype(jnp.float32, near), _with_dtype(jnp.float32, pair)
     zero = (jnp.zeros_like(points.focal_left),) * 5
-    return _moved(
+    return _take_step(
         near, normal.steps(distances(points, single), zero, count - 1, LONGEST)
     )
 
 
-def _moved(pose: RelativePose, step: tuple[Array, ...]) -> RelativePose:
+def _take_step(pose: RelativePose, step: tuple[Array, ...]) -> RelativePose:
     """The pose after a step of any precision, or unchanged where that is not finite."""
     fine = jnp.isfinite(sum(step))
-    there = pose.moved(_with_dtype(pose.qw.dtype, step)).normalised()
+    there = pose.move(_with_dtype(pose.qw.dtype, step)).normalise()
     return jax.tree.map(lambda new, old: jnp.where(fine, new, old), there, pose)
 
 

@@ -83,7 +83,7 @@ def _solve(
     ).reshape(4, 3, 3, -1)
     matrix = _elimination(constraints(basis))
     z, w, real = _real_roots(determinant(matrix))
-    solutions = _polished(basis, essential_coefficients(matrix, z, w), steps)
+    solutions = _polish(basis, essential_coefficients(matrix, z, w), steps)
     essentials = jnp.sum(basis[:, :, :, None] * solutions[:, None, None], axis=0)
     return essentials * jnp.sqrt(2.0), real
 
@@ -291,7 +291,7 @@ def _unit(a: Float[Array, "4 root problem"]) -> Float[Array, "4 root problem"]:
     return a * lax.rsqrt(jnp.maximum(jnp.sum(a * a, axis=0), TINY))[None]
 
 
-def _polished(
+def _polish(
     basis: Float[Array, "4 3 3 problem"], a: Float[Array, "4 root problem"], steps: int
 ):
     """Gauss-Newton on F = (E Eᵀ - tr(E Eᵀ)/2 I) E = 0 over the four coefficients, |a| =

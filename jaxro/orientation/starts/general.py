@@ -16,7 +16,7 @@ from ...adjustment.normal_equations import steps
 from ...geometry import rotations as rot
 from ...geometry.coplanarity import common_focal
 from ...geometry.elements import RelativePose, vertical
-from ...geometry.pairs import Pair, cleaned, pad
+from ...geometry.pairs import Pair, mask_unusable, pad
 from ...xla.selection import where_needed
 from .. import degeneracy, planes
 from ..degeneracy import significant
@@ -72,17 +72,16 @@ class General(AbstractStart):
         )
 
     def _begin(self, pair: Pair) -> StartingPose:
-        pair = pad(
-            pair, max(pair.x_left.shape[0], 1)
-        )  # of no points there are no candidates to choose from
+        # of no points there are no candidates to choose from
+        pair = pad(pair, max(pair.x_left.shape[0], 1))
         pair = _accurate(pair)
         judges = _spread(pair, JUDGES)
         poses, real = self._candidates(pair, judges)
         chosen, found = _best_different(judges, poses, real, self.refined)
-        chosen = jax.vmap(lambda pose: _refined(judges, pose, self.steps))(chosen)
+        chosen = jax.vmap(lambda pose: _refine(judges, pose, self.steps))(chosen)
         best, alone = _best_different(judges, chosen, found, 2)
         if judges is not pair:
-            best = jax.vmap(lambda pose: _refined(pair, pose, FINAL))(best)
+            best = jax.vmap(lambda pose: _refine(pair, pose, FINAL))(best)
             best, alone = _best_different(pair, best, alone, 2)
         best, alone = _with_twin(pair, best, alone)
         first, second = (jax.tree.map(lambda a, i=i: a[i], best) for i in (0, 1))
@@ -97,7 +96,7 @@ class General(AbstractStart):
         sigma0 = jnp.sqrt(squares * weight / jnp.maximum(freedom, 1.0))
         expected = degeneracy.noise(sigma0, freedom, inspected.sigma, pair.focal_left)
         ambiguous = ambiguous & (
-            other < expected.tolerated(squares * weight) / weight + EXACT
+            other < expected.tolerance(squares * weight) / weight + EXACT
         )
         turn, parallax = rotation_only(left, right, pair.mask)
         noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
@@ -155,9 +154,9 @@ def _accurate(pair: Pair) -> Pair:
     """The pair without its coarse points, of which a start has nothing to learn, if
     enough are left."""
     good = pair.mask & ~pair.coarse
-    return cleaned(pair.with_mask(jnp.where(jnp.sum(good) >= ENOUGH, good, pair.mask)))[
-        0
-    ]
+    return mask_unusable(
+        pair.with_mask(jnp.where(jnp.sum(good) >= ENOUGH, good, pair.mask))
+    )[0]
 
 
 def vectors(pair: Pair) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
@@ -246,12 +245,10 @@ def _with_twin(pair: Pair, best: RelativePose, alone: Bool[Array, "2"]):
     return _best_different(pair, three, jnp.concatenate([alone, exists[None]]), 2)
 
 
-def _refined(pair: Pair, pose: RelativePose, count: int) -> RelativePose:
+def _refine(pair: Pair, pose: RelativePose, count: int) -> RelativePose:
     """The pose after some Gauss-Newton steps, or unchanged where they fail."""
     zero = jnp.zeros_like(pair.focal_left)
-    moved = pose.moved(
-        steps(distances(pair, pose), (zero,) * 5, count, 0.3)
-    ).normalised()
+    moved = pose.move(steps(distances(pair, pose), (zero,) * 5, count, 0.3)).normalise()
     better = inspect(pair, moved).distance <= inspect(pair, pose).distance
     return jax.tree.map(lambda new, old: jnp.where(better, new, old), moved, pose)
 
@@ -277,9 +274,8 @@ def rotation_only(left, right, mask) -> tuple[RelativePose, Float[Array, ""]]:
             jnp.concatenate([side[:, None], corner], axis=1),
         ]
     )
-    k = k + jnp.sum(weight) * jnp.eye(
-        4
-    )  # all eigenvalues positive, so that squaring favours the largest
+    # all eigenvalues positive, so that squaring favours the largest
+    k = k + jnp.sum(weight) * jnp.eye(4)
 
     def square(_, k):
         k = k / jnp.sqrt(jnp.sum(k * k))
@@ -290,7 +286,7 @@ def rotation_only(left, right, mask) -> tuple[RelativePose, Float[Array, ""]]:
     q = jnp.sum(jnp.where(longest[None, :], k, 0.0), axis=1)
     q = q / jnp.sqrt(jnp.sum(q * q))
     zero = jnp.zeros_like(q[0])
-    pose = RelativePose(q[0], q[1], q[2], q[3], zero + 1, zero, zero).normalised()
+    pose = RelativePose(q[0], q[1], q[2], q[3], zero + 1, zero, zero).normalise()
     rotation, _ = pose.relative()
     turned = jax.vmap(lambda v: rot.as_array(rot.apply(rotation, (v[0], v[1], v[2]))))(
         r

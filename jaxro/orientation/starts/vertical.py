@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from ...geometry.pairs import Pair
-from .base import AbstractStart, StartingPose, approached
+from .base import AbstractStart, StartingPose, approach
 
 
 class Vertical(AbstractStart):
@@ -18,4 +18,4 @@ class Vertical(AbstractStart):
 
     def __call__(self, pair: Pair) -> StartingPose:
         no = jnp.zeros_like(pair.focal_left, bool)
-        return StartingPose(approached(pair, self.steps), no, no)
+        return StartingPose(approach(pair, self.steps), no, no)
