@@ -4,11 +4,12 @@ meet."""
 from collections.abc import Callable
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from . import coplanarity, rotations as rot
 from .elements import AbstractElements, RelativePose
 from .pairs import Pair
+from .rotations import Matrix, Vector
 
 AT_INFINITY = 1e-3
 """Base over distance below which a point counts as infinitely far, so that the sign of
@@ -34,37 +35,45 @@ def model_point(
     rotation, base = pose.relative()
     focals = pair.focal_left, pair.focal_right
     f = coplanarity.fundamental_matrix(rotation, base, *focals)
+    frame, right, placed = _in_frame(chosen, rotation, base, scale)
 
-    frame, right, placed = None, rotation, base
-    if not isinstance(chosen, RelativePose):
-        x, y, z = chosen.model_frame()
-        frame = rot.scale(x, scale), rot.scale(y, scale), rot.scale(z, scale)
-        right, placed = rot.product(frame, rotation), rot.apply(frame, base)
-
-    def one(point, sigma, use):
-        x1, y1, x2, y2 = (
-            c + dv
-            for c, dv in zip(point, coplanarity.corrections(f, point, use), strict=True)
-        )
-        corrected = x1, y1, x2, y2
+    def of_point(point, sigma, use):
+        v = coplanarity.corrections(f, point, use)
+        corrected = tuple(c + dv for c, dv in zip(point, v, strict=True))
         rays = coplanarity.directions(None, rotation, corrected, *focals)
         lam, mu, near = coplanarity.depths(*rays, base)
-        # the angle between the rays has the variance sigma² (1 / |r1|² + 1 / |r2|²)
-        uncertain = (SIGNIFICANT * noise * sigma) ** 2 * sum(
-            rot.dot(ray, ray) for ray in rays
-        ) * near > 1
+        uncertain = _is_uncertain(rays, near, noise * sigma)
         # of parallel rays by the side on which they would meet
         in_front = use & (lam > 0) & (mu > 0)
         lam, mu = lam * near, mu * near
-        model = coplanarity.halfway(
-            *coplanarity.directions(frame, right, corrected, *focals), placed, lam, mu
-        )
-        least = jnp.minimum(
-            jnp.abs(lam) * pair.focal_left, jnp.abs(mu) * pair.focal_right
-        )
+        placed_rays = coplanarity.directions(frame, right, corrected, *focals)
+        model = coplanarity.halfway(*placed_rays, placed, lam, mu)
+        distances = jnp.abs(lam) * pair.focal_left, jnp.abs(mu) * pair.focal_right
         finite = use & (near > 0)
+        near_enough = jnp.minimum(*distances) * AT_INFINITY < 1
+        behind = finite & near_enough & ~uncertain & ~in_front
         keep = finite & jnp.isfinite(lam) & jnp.isfinite(mu)
-        behind = finite & (least * AT_INFINITY < 1) & ~uncertain & ~in_front
         return tuple(jnp.where(keep, c, 0.0) for c in model), in_front, behind
 
-    return one
+    return of_point
+
+
+def _in_frame(
+    chosen: AbstractElements, rotation: Matrix, base: Vector, scale: Float[Array, ""]
+) -> tuple[Matrix | None, Matrix, Vector]:
+    """The rotations of left and right rays, and the base, in the model frame of the
+    chosen elements and with its scale; None for the left photo's own frame."""
+    if isinstance(chosen, RelativePose):
+        return None, rotation, base
+    x, y, z = (rot.scale(row, scale) for row in chosen.model_frame())
+    frame = x, y, z
+    return frame, rot.product(frame, rotation), rot.apply(frame, base)
+
+
+def _is_uncertain(
+    rays: tuple[Vector, Vector], near: Float[Array, ""], deviation: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether the angle between two rays may as well have the other sign: it has the
+    variance deviation² (1 / |r1|² + 1 / |r2|²)."""
+    squares = sum(rot.dot(ray, ray) for ray in rays)
+    return (SIGNIFICANT * deviation) ** 2 * squares * near > 1

@@ -38,7 +38,7 @@ def cross(a: Vector, b: Vector) -> Vector:
     )
 
 
-def scale(a: Vector, factor: Scalar) -> Vector:
+def scale(a: Vector, factor: Scalar | float) -> Vector:
     """factor * a"""
     return (a[0] * factor, a[1] * factor, a[2] * factor)
 
@@ -54,7 +54,7 @@ def unit(a: Vector) -> Vector:
     return scale(a, 1 / jnp.sqrt(dot(a, a)))
 
 
-def add_scaled(a: Vector, b: Vector, factor: Scalar) -> Vector:
+def add_scaled(a: Vector, b: Vector, factor: Scalar | float) -> Vector:
     """a + factor b"""
     return (a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2])
 

@@ -76,67 +76,103 @@ def worst_direction(
     through both stations, have there another minimum that the linearised statistics of
     the first know nothing of.
     """
-    scaled, units = in_radians(elements, cofactor)
-    direction = computed_once(_worst)(scaled)
-    length = jnp.sqrt(sum((e * e for e in direction), jnp.zeros(())))
-    direction = [e / length * unit for e, unit in zip(direction, units, strict=True)]
-    zero = jnp.zeros_like(pair.focal_left)
+    direction = _worst_of(elements, cofactor)
+    matrices = _bend(pair, elements, direction)
+    bent = _sum_along(pair, *matrices)
+    ratio = bent.change / jnp.where(bent.drift > 0, bent.drift, 1.0)
+    reach = jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0))
+    margin = jnp.where(bent.drift > 0, reach, jnp.inf)
 
-    def fundamental(rotation, base):
-        return coplanarity.fundamental_matrix(
-            rotation, base, pair.focal_left, pair.focal_right
-        )
-
-    along = lambda t: elements.move(tuple(t * e for e in direction)).relative()
-    (rotation, base), (turning, moving) = jax.jvp(
-        along, (zero,), (jnp.ones_like(zero),)
-    )
-    # F is linear in R and in b; of a steady turn R'' = R' Rᵀ R', of a steady shift b''
-    # = 0
-    f = fundamental(rotation, base)
-    slope = _plus(fundamental(turning, base), fundamental(rotation, moving))
-    bending = rot.product(turning, rot.product(rot.transpose(rotation), turning))
-    curve = _plus(
-        fundamental(bending, base),
-        fundamental(turning, tuple(2 * entry for entry in moving)),
-    )
-
-    def one(point, sigma, use):
-        _, square, b = coplanarity.linearise(f, point, use)
-        g, moved, turned = coplanarity.linearise(slope, point, use)
-        weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
-        bent = (
-            coplanarity.condition(curve, point)
-            - 2 * g * sum(x * y for x, y in zip(b, turned, strict=True)) / square
-        )
-        by_f = sum(jax.grad(coplanarity.condition)(f, point), ())
-        terms = g**2 * weight, moved * sigma**2 * weight, bent**2 * weight
-        return *terms, *(bent * weight * entry for entry in by_f)
-
-    change, drift, bends, *products = sums(
-        jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask)
-    )
-    ratio = change / jnp.where(drift > 0, drift, 1.0)
-    margin = jnp.where(drift > 0, jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0)), jnp.inf)
-
-    by_entry = tuple(products[:3]), tuple(products[3:6]), tuple(products[6:])
-    _, slopes = elements.slopes(fundamental, (zero,) * 5)
-    columns = computed_once(
-        lambda slopes: [inner(by_entry, slope) for slope in slopes]
-    )(slopes)  # Aᵀc
+    columns = _along_columns(pair, elements, bent.by_entry)  # Aᵀc
     taken = quadratic([list(row) for row in cofactor], columns)
     back = jnp.abs(sum(e * h for e, h in zip(direction, columns, strict=True)))
     straight = back <= 0
-    t = jnp.where(straight, jnp.inf, 2 * change / jnp.where(straight, 1.0, back))
-    rise = jnp.maximum(bends - taken, 0.0) * t**4 / 4
-    return WorstDirection(margin, t * jnp.sqrt(jnp.maximum(change, 0.0)), t, rise)
+    turn = 2 * bent.change / jnp.where(straight, 1.0, back)
+    turn = jnp.where(straight, jnp.inf, turn)
+    return WorstDirection(
+        margin=margin,
+        away=turn * jnp.sqrt(jnp.maximum(bent.change, 0.0)),
+        turn=turn,
+        rise=jnp.maximum(bent.bends - taken, 0.0) * turn**4 / 4,
+    )
+
+
+def _worst_of(elements: AbstractElements, cofactor: Float[Array, "5 5"]) -> list:
+    """The worst determined direction, of length 1 in rad, in the units of the
+    elements."""
+    in_rad, units = in_radians(elements, cofactor)
+    direction = computed_once(_worst)(in_rad)
+    length = jnp.sqrt(sum((e * e for e in direction), jnp.zeros(())))
+    return [e / length * unit for e, unit in zip(direction, units, strict=True)]
+
+
+def _bend(pair: Pair, elements: AbstractElements, direction: list) -> tuple:
+    """F and its first and second derivative along a direction of the elements.
+
+    F is linear in R and in b; of a steady turn R'' = R' Rᵀ R', of a steady shift
+    b'' = 0.
+    """
+    zero = jnp.zeros_like(pair.focal_left)
+    focals = pair.focal_left, pair.focal_right
+    fundamental = lambda r, b: coplanarity.fundamental_matrix(r, b, *focals)
+    along = lambda t: elements.move(tuple(t * e for e in direction)).relative()
+    one = jnp.ones_like(zero)
+    (rotation, base), (turning, moving) = jax.jvp(along, (zero,), (one,))
+    bending = rot.product(turning, rot.product(rot.transpose(rotation), turning))
+    f = fundamental(rotation, base)
+    slope = _plus(fundamental(turning, base), fundamental(rotation, moving))
+    twice = fundamental(turning, rot.scale(moving, 2))
+    return f, slope, _plus(fundamental(bending, base), twice)
+
+
+class _Bent(NamedTuple):
+    """Sums over the points, with the weights w = 1 / (sigma |∇g|)²: `change` Σ w g'²,
+    `drift` Σ w sigma² |∇g'|², `bends` Σ c² and, by the entries of F, Σ c ∂g/∂F times
+    the root of w."""
+
+    change: Float[Array, ""]
+    drift: Float[Array, ""]
+    bends: Float[Array, ""]
+    by_entry: rot.Matrix
+
+
+def _sum_along(
+    pair: Pair, f: rot.Matrix, slope: rot.Matrix, curve: rot.Matrix
+) -> _Bent:
+    """The sums for F and its derivatives along a direction."""
+
+    def of_point(point, sigma, use):
+        _, square, b = coplanarity.linearise(f, point, use)
+        g, drift, turned = coplanarity.linearise(slope, point, use)
+        weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
+        steepens = sum(x * y for x, y in zip(b, turned, strict=True)) / square
+        bent = coplanarity.condition(curve, point) - 2 * g * steepens
+        by_f = sum(jax.grad(coplanarity.condition)(f, point), ())
+        own = g**2 * weight, drift * sigma**2 * weight, bent**2 * weight
+        return *own, *(bent * weight * entry for entry in by_f)
+
+    of_points = jax.vmap(of_point)(pair.coordinates, pair.sigma, pair.mask)
+    change, drift, bends, *products = sums(of_points)
+    p11, p12, p13, p21, p22, p23, p31, p32, p33 = products
+    by_entry = (p11, p12, p13), (p21, p22, p23), (p31, p32, p33)
+    return _Bent(change=change, drift=drift, bends=bends, by_entry=by_entry)
+
+
+def _along_columns(
+    pair: Pair, elements: AbstractElements, by_entry: rot.Matrix
+) -> list:
+    """Products with the five columns of the design of what has these with the entries
+    of F."""
+    focals = pair.focal_left, pair.focal_right
+    fundamental = lambda r, b: coplanarity.fundamental_matrix(r, b, *focals)
+    _, slopes = elements.slopes(fundamental, (jnp.zeros_like(pair.focal_left),) * 5)
+    products = lambda slopes: [inner(by_entry, slope) for slope in slopes]
+    return computed_once(products)(slopes)
 
 
 def _plus(a: rot.Matrix, b: rot.Matrix) -> rot.Matrix:
-    return tuple(
-        tuple(x + y for x, y in zip(*rows, strict=True))
-        for rows in zip(a, b, strict=True)
-    )  # pyright: ignore
+    rows = zip(a, b, strict=True)
+    return tuple(tuple(x + y for x, y in zip(*both, strict=True)) for both in rows)  # pyright: ignore
 
 
 def _worst(cofactor: Float[Array, "p p"]) -> list:

@@ -47,7 +47,7 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
     f = coplanarity.fundamental_matrix(rotation, base, *focals)
     seen = coplanarity.common_focal(*focals)
 
-    def one(point, sigma, use):
+    def of_point(point, sigma, use):
         first, second, w2, *depths = coplanarity.rays(
             None, rotation, base, point, *focals
         )
@@ -57,34 +57,30 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
         # XLA gives a quotient that is used twice a loop of its own, but not a selection
         # of it
         ratio = jnp.where(use, w2 / (length * rot.dot(second, second) * sigma**2), 0.0)
-        radius = length - pair.focal_left**2
         # λ = depths[0] / w2; all over f1, which has no sign
-        seen_by_twin = jnp.where(
-            w2 - 2 * depths[0] * rot.dot(base, first) > 0, left, -left
-        )
+        twin_side = w2 - 2 * depths[0] * rot.dot(base, first)
         terms = (
             jnp.ones_like(g),
             left + right,
-            seen_by_twin,
+            jnp.where(twin_side > 0, left, -left),
             g * g / square,
-            radius,
+            length - pair.focal_left**2,
             ratio * sigma**2,
             ratio * seen**2,
             sigma**2,
         )
         return tuple(jnp.where(use, term, 0.0) for term in terms)
 
-    number, in_front, twin, *squares = sums(
-        jax.vmap(one)(pair.coordinates, pair.sigma, pair.mask)
-    )
+    of_points = jax.vmap(of_point)(pair.coordinates, pair.sigma, pair.mask)
+    number, in_front, twin, *squares = sums(of_points)
     mean = lambda square: jnp.sqrt(jnp.maximum(square, 0.0) / jnp.maximum(number, 1.0))
     distance, spread, angle, parallax, sigma = map(mean, squares)
     return Inspection(
-        in_front,
-        distance / pair.focal_left,
-        spread / pair.focal_left,
-        angle,
-        parallax,
-        sigma,
-        jnp.abs(twin) >= ONE_SIDE * number,
+        in_front=in_front,
+        distance=distance / pair.focal_left,
+        spread=spread / pair.focal_left,
+        angle=angle,
+        parallax=parallax,
+        sigma=sigma,
+        twin=jnp.abs(twin) >= ONE_SIDE * number,
     )

@@ -14,6 +14,7 @@ same homography, so that points in the plane cannot tell the two apart (Longuet-
     b' = β w / 2 - n,    β chosen so that det A' = det A,    R' = (A A'⁻¹)ᵀ R.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -168,59 +169,73 @@ def plane(
     """The plane nearest to the points in use: n of c x p1 = (c x b) (n · p1), c = R p2,
     linear, in turns in which points off it lose their weight. A point lies in it if the
     homography takes p1 to p2 within `limit` standard deviations."""
-    rotation, base = pose.relative()
-    back = rot.transpose(rotation)
+    columns, target, sure = _inverse_depths(pair, pose)
+    transfer_errors = _transfer_errors(pair, pose)
+    square = jnp.asarray(limit, pair.sigma.dtype) ** 2
 
-    def rays(point):
-        x1, y1, x2, y2 = point
-        left = (x1 / pair.focal_left, y1 / pair.focal_left, -jnp.ones_like(x1))
-        right = (x2 / pair.focal_right, y2 / pair.focal_right, -jnp.ones_like(x2))
-        return left, right
-
-    def inverse_depth(point):
-        left, right = rays(point)
-        c = rot.apply(rotation, right)
-        across = rot.cross(c, base)
-        squared = rot.dot(across, across)
-        return (
-            *left,
-            rot.dot(across, rot.cross(c, left)) / jnp.where(squared > 0, squared, 1.0),
-            squared,
-        )
-
-    def error(point, sigma, normal):
-        left, _ = rays(point)
-        nearness = rot.dot(normal, left)
-        x, y, z = rot.apply(back, rot.add_scaled(left, base, -nearness))
-        safe = jnp.where(z < 0, z, -1.0)
-        off = (pair.focal_right * x / -safe - point[2]) ** 2 + (
-            pair.focal_right * y / -safe - point[3]
-        ) ** 2
-        return jnp.where(z < 0, off / (2 * sigma**2), jnp.inf)
-
-    *columns, target, sure = jax.vmap(inverse_depth)(pair.coordinates)
-    errors = jax.vmap(error, in_axes=(0, 0, None))
-
-    def solved(weight):
-        n, h, _ = accumulate(
-            [target], [[c] for c in columns], [jnp.where(use, weight, 0.0)]
-        )
+    def fit(weight):
+        weights = [jnp.where(use, weight, 0.0)]
+        n, h, _ = accumulate([target], [[c] for c in columns], weights)
         return tuple(solve(n, h))
 
     def turn(_, normal):
-        s = (
-            errors(pair.coordinates, pair.sigma, normal)
-            / jnp.asarray(limit, pair.sigma.dtype) ** 2
-        )
-        return solved(sure / (1 + jnp.minimum(s, 1e6)))
+        s = transfer_errors(normal) / square
+        return fit(sure / (1 + jnp.minimum(s, 1e6)))
 
-    normal = lax.fori_loop(0, TURNS, turn, solved(sure))
-    within = use & (
-        errors(pair.coordinates, pair.sigma, normal)
-        <= jnp.asarray(limit, pair.sigma.dtype) ** 2
-    )
+    normal = lax.fori_loop(0, TURNS, turn, fit(sure))
+    within = use & (transfer_errors(normal) <= square)
     finite = jnp.stack([jnp.where(jnp.isfinite(c), c, 0.0) for c in normal])
     return Plane(finite, within, count(within) / jnp.maximum(count(use), 1.0))
+
+
+def _plus_outer(m: rot.Matrix, a: rot.Vector, b: rot.Vector) -> rot.Matrix:
+    """M + a bᵀ"""
+    row = lambda i: rot.add_scaled(m[i], b, a[i])
+    return row(0), row(1), row(2)
+
+
+def _rays(pair: Pair, point: coplanarity.Point) -> tuple[rot.Vector, rot.Vector]:
+    """p1 and p2 over their focal lengths."""
+    x1, y1, x2, y2 = point
+    left = (x1 / pair.focal_left, y1 / pair.focal_left, -jnp.ones_like(x1))
+    right = (x2 / pair.focal_right, y2 / pair.focal_right, -jnp.ones_like(x2))
+    return left, right
+
+
+def _inverse_depths(pair: Pair, pose: RelativePose) -> tuple[list, Array, Array]:
+    """The coordinates of p1, the inverse depth n · p1 of every point at the pose, and
+    its weight |c x b|²."""
+    rotation, base = pose.relative()
+
+    def of_point(point):
+        left, right = _rays(pair, point)
+        c = rot.apply(rotation, right)
+        across = rot.cross(c, base)
+        squared = rot.dot(across, across)
+        safe = jnp.where(squared > 0, squared, 1.0)
+        return left, rot.dot(across, rot.cross(c, left)) / safe, squared
+
+    columns, target, sure = jax.vmap(of_point)(pair.coordinates)
+    return list(columns), target, sure
+
+
+def _transfer_errors(pair: Pair, pose: RelativePose) -> Callable:
+    """A function of the normal: the squared distance of every point from where the
+    homography takes p1, over 2 sigma²."""
+    rotation, base = pose.relative()
+    back = rot.transpose(rotation)
+
+    def of_point(point, sigma, normal):
+        left, _ = _rays(pair, point)
+        nearness = rot.dot(normal, left)
+        x, y, z = rot.apply(back, rot.add_scaled(left, base, -nearness))
+        safe = jnp.where(z < 0, z, -1.0)
+        dx = pair.focal_right * x / -safe - point[2]
+        dy = pair.focal_right * y / -safe - point[3]
+        return jnp.where(z < 0, (dx**2 + dy**2) / (2 * sigma**2), jnp.inf)
+
+    of_points = jax.vmap(of_point, in_axes=(0, 0, None))
+    return lambda normal: of_points(pair.coordinates, pair.sigma, normal)
 
 
 def twin(pose: RelativePose, normal: Float[Array, "3"]) -> Twin:
@@ -229,23 +244,16 @@ def twin(pose: RelativePose, normal: Float[Array, "3"]) -> Twin:
     two orientations are one."""
     rotation, b = pose.relative()
     n = (normal[0], normal[1], normal[2])
-    w = tuple(p / 2 - q for p, q in zip(n, b, strict=True))
-    det, square = 1 - rot.dot(b, n), rot.dot(w, w)  # pyright: ignore[reportArgumentType]
+    w = rot.add_scaled(rot.scale(n, 0.5), b, -1.0)
+    det, square = 1 - rot.dot(b, n), rot.dot(w, w)
     there = (jnp.abs(det) > LEAST) & (square > LEAST**2)
     det, square = jnp.where(there, det, 1.0), jnp.where(there, square, 1.0)
-    beta = 2 * (1 + rot.dot(n, w) - det) / square  # pyright: ignore[reportArgumentType]
-    other = tuple(beta / 2 * p - q for p, q in zip(w, n, strict=True))
-    eye = rot.identity(det)
-    first = tuple(
-        tuple(e - b[i] * n[j] for j, e in enumerate(row)) for i, row in enumerate(eye)
-    )
-    # A'⁻¹
-    second = tuple(
-        tuple(e + other[i] * w[j] / det for j, e in enumerate(row))
-        for i, row in enumerate(eye)
-    )
-    turned = rot.product(rot.transpose(rot.product(first, second)), rotation)  # pyright: ignore[reportArgumentType]
-    length = jnp.sqrt(rot.dot(other, other))  # pyright: ignore[reportArgumentType]
+    beta = 2 * (1 + rot.dot(n, w) - det) / square
+    other = rot.add_scaled(rot.scale(w, beta / 2), n, -1.0)
+    homography = _plus_outer(rot.identity(det), rot.scale(b, -1.0), n)
+    inverse = _plus_outer(rot.identity(det), rot.scale(other, 1 / det), w)
+    turned = rot.product(rot.transpose(rot.product(homography, inverse)), rotation)
+    length = jnp.sqrt(rot.dot(other, other))
     there = there & (length > LEAST)
     length = jnp.where(there, length, 1.0)
     found = RelativePose(

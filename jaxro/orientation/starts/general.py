@@ -73,39 +73,36 @@ class General(AbstractStart):
 
     def _begin(self, pair: Pair) -> StartingPose:
         # of no points there are no candidates to choose from
-        pair = pad(pair, max(pair.x_left.shape[0], 1))
-        pair = _accurate(pair)
+        pair = _accurate(pad(pair, max(pair.x_left.shape[0], 1)))
+        first, second, exists = self._two_best(pair)
+        left, right = vectors(pair)
+        freedom = pair.count - 5
+        squares = inspect(pair, first).distance ** 2
+        turn, parallax = rotation_only(left, right, pair.mask)
+        noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
+        focal = common_focal(pair.focal_left, pair.focal_right)
+        noise = noise * pair.focal_left / focal
+        pure = parallax < significant(freedom) * noise + 1e-9
+        in_front = _behind(second, left, right, pair.mask) <= BEHIND
+        ambiguous = exists & in_front & _fits_as_well(pair, first, second)
+        pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
+        return StartingPose(pose, ambiguous & ~pure, pure)
+
+    def _two_best(
+        self, pair: Pair
+    ) -> tuple[RelativePose, RelativePose, Bool[Array, ""]]:
+        """The best candidate, the best other one, and whether there is another one."""
         judges = _spread(pair, JUDGES)
         poses, real = self._candidates(pair, judges)
         chosen, found = _best_different(judges, poses, real, self.refined)
         chosen = jax.vmap(lambda pose: _refine(judges, pose, self.steps))(chosen)
-        best, alone = _best_different(judges, chosen, found, 2)
+        best, exist = _best_different(judges, chosen, found, 2)
         if judges is not pair:
             best = jax.vmap(lambda pose: _refine(pair, pose, FINAL))(best)
-            best, alone = _best_different(pair, best, alone, 2)
-        best, alone = _with_twin(pair, best, alone)
+            best, exist = _best_different(pair, best, exist, 2)
+        best, exist = _with_twin(pair, best, exist)
         first, second = (jax.tree.map(lambda a, i=i: a[i], best) for i in (0, 1))
-        inspected = inspect(pair, first)
-        squares, other = inspected.distance**2, inspect(pair, second).distance ** 2
-        left, right = vectors(pair)
-        freedom = pair.count - 5
-        ambiguous = alone[1] & (_behind(second, left, right, pair.mask) <= BEHIND)
-        # distances over f in place of residuals: sigma over f is their unit
-        unit = jnp.where(inspected.sigma > 0, inspected.sigma, 1.0) / pair.focal_left
-        weight = pair.count / unit**2
-        sigma0 = jnp.sqrt(squares * weight / jnp.maximum(freedom, 1.0))
-        expected = degeneracy.noise(sigma0, freedom, inspected.sigma, pair.focal_left)
-        ambiguous = ambiguous & (
-            other < expected.tolerance(squares * weight) / weight + EXACT
-        )
-        turn, parallax = rotation_only(left, right, pair.mask)
-        noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
-        noise = (
-            noise * pair.focal_left / common_focal(pair.focal_left, pair.focal_right)
-        )
-        pure = parallax < significant(freedom) * noise + 1e-9
-        pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
-        return StartingPose(pose, ambiguous & ~pure, pure)
+        return first, second, exist[1]
 
     def _candidates(
         self, pair: Pair, judges: Pair
@@ -127,6 +124,22 @@ class General(AbstractStart):
         normal_case = jax.tree.map(lambda a: a[None], vertical(pair.focal_left))
         poses = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), poses, normal_case)
         return poses, jnp.concatenate([real, jnp.ones(1, bool)])
+
+
+def _fits_as_well(
+    pair: Pair, first: RelativePose, second: RelativePose
+) -> Bool[Array, ""]:
+    """Whether the second pose fits as well as the first, for the measuring errors."""
+    inspected = inspect(pair, first)
+    squares = inspected.distance**2
+    other = inspect(pair, second).distance ** 2
+    freedom = pair.count - 5
+    # distances over f in place of residuals: sigma over f is their unit
+    unit = jnp.where(inspected.sigma > 0, inspected.sigma, 1.0) / pair.focal_left
+    weight = pair.count / unit**2
+    sigma0 = jnp.sqrt(squares * weight / jnp.maximum(freedom, 1.0))
+    noise = degeneracy.noise(sigma0, freedom, inspected.sigma, pair.focal_left)
+    return other < noise.tolerance(squares * weight) / weight + EXACT
 
 
 def _spread(pair: Pair, count: int) -> Pair:
