@@ -127,11 +127,14 @@ class RelativePose(AbstractElements):
         return jnp.stack([self.bx, self.by, self.bz], axis=-1)
 
     def relative(self) -> tuple[Matrix, Vector]:
-        return rot.from_quaternion(self.qw, self.qx, self.qy, self.qz), (
-            self.bx,
-            self.by,
-            self.bz,
-        )
+        rotation = rot.from_quaternion(self.qw, self.qx, self.qy, self.qz)
+        return rotation, (self.bx, self.by, self.bz)
+
+    def turn_base(self, sign: Scalar) -> "RelativePose":
+        """The pose with its base times 1 or -1, which the condition does not tell
+        apart."""
+        quaternion = self.qw, self.qx, self.qy, self.qz
+        return RelativePose(*quaternion, *rot.scale((self.bx, self.by, self.bz), sign))
 
     def model_frame(self) -> Matrix:
         return rot.identity(self.qw)
@@ -343,7 +346,7 @@ class DependentElements(AbstractElements):
 def vertical(like: Scalar) -> RelativePose:
     """The normal case of aerial photography: parallel axes, base along x."""
     one, zero = jnp.ones_like(like), jnp.zeros_like(like)
-    return RelativePose(one, zero, zero, zero, one, zero, zero)
+    return RelativePose(qw=one, qx=zero, qy=zero, qz=zero, bx=one, by=zero, bz=zero)
 
 
 def to_pose(elements: AbstractElements) -> RelativePose:

@@ -308,14 +308,14 @@ def unstack(batch: Pair) -> list[Pair]:
 def swapped(one: Pair) -> Pair:
     """The same pair with left and right exchanged."""
     return Pair(
-        one.x_right,
-        one.y_right,
-        one.x_left,
-        one.y_left,
-        one.sigma,
-        one.mask,
-        one.focal_right,
-        one.focal_left,
+        x_left=one.x_right,
+        y_left=one.y_right,
+        x_right=one.x_left,
+        y_right=one.y_left,
+        sigma=one.sigma,
+        mask=one.mask,
+        focal_left=one.focal_right,
+        focal_right=one.focal_left,
     )
 
 

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool
 
-from ..geometry import rotations as rot
 from ..geometry.elements import (
     AbstractElements,
     DependentElements,
@@ -28,14 +27,7 @@ def face_points(
     if not free:
         return pose, jnp.zeros_like(pose.qw, bool)
     turn = inspected.in_front < 0
-    sign = jnp.where(turn, -1.0, 1.0)
-    return RelativePose(
-        pose.qw,
-        pose.qx,
-        pose.qy,
-        pose.qz,
-        *rot.scale((pose.bx, pose.by, pose.bz), sign),
-    ), turn
+    return pose.turn_base(jnp.where(turn, -1.0, 1.0)), turn
 
 
 def length(
@@ -70,16 +62,12 @@ def in_system(
     sign = jnp.where(flipped, -1.0, 1.0)
 
     def at(step: tuple) -> AbstractElements:
-        pose = to_pose(solved.move(step))
-        base = (pose.bx * sign, pose.by * sign, pose.bz * sign)
-        return convert(
-            RelativePose(pose.qw, pose.qx, pose.qy, pose.qz, *base), system, length
-        )
+        pose = to_pose(solved.move(step)).turn_base(sign)
+        return convert(pose, system, length)
 
     origin = (jnp.zeros_like(length),) * 5
-    if (
-        system is RelativePose
-    ):  # `tangents` of -b are those of b, the second one turned: b1 changes its sign
+    # `tangents` of -b are those of b, the second one turned: b1 changes its sign
+    if system is RelativePose:
         one = jnp.ones_like(sign)
         signs = jnp.stack([one, one, one, sign, one])
         return at(origin), cofactor * signs[:, None] * signs[None, :]

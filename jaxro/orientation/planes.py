@@ -287,15 +287,7 @@ def facing(pair: Pair, pose: RelativePose) -> RelativePose:
     """The pose with the base on the side on which most points lie in front of both
     photos."""
     sign = jnp.where(inspect(pair, pose).in_front < 0, -1.0, 1.0)
-    return RelativePose(
-        pose.qw,
-        pose.qx,
-        pose.qy,
-        pose.qz,
-        pose.bx * sign,
-        pose.by * sign,
-        pose.bz * sign,
-    )
+    return pose.turn_base(sign)
 
 
 def behind(pair: Pair, pose: RelativePose) -> Float[Array, ""]:

@@ -299,7 +299,7 @@ def rotation_only(left, right, mask) -> tuple[RelativePose, Float[Array, ""]]:
     q = jnp.sum(jnp.where(longest[None, :], k, 0.0), axis=1)
     q = q / jnp.sqrt(jnp.sum(q * q))
     zero = jnp.zeros_like(q[0])
-    pose = RelativePose(q[0], q[1], q[2], q[3], zero + 1, zero, zero).normalise()
+    pose = RelativePose(*q, *(zero + 1, zero, zero)).normalise()
     rotation, _ = pose.relative()
     turned = jax.vmap(lambda v: rot.as_array(rot.apply(rotation, (v[0], v[1], v[2]))))(
         r
