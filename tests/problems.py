@@ -3,6 +3,7 @@
 import csv
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import oracles
 import jaxro
 from jaxro import DependentElements, IndependentElements, Pair, RelativePose, pair
 from jaxro.experiments import dorozhinsky1971
-from jaxro.geometry import mock_pairs
+from jaxro.geometry import mock_pairs, rotations
 from jaxro.xla.settings import COMPILE_FAST, known_settings
 
 orient = jaxro.orient
@@ -73,6 +74,81 @@ def tilted(sigma: float = 0.01, seed: int = 0) -> Pair:
     return mock_pairs.noisy(
         mock_pairs.mock_pair(layout, elements, heights=heights), noise_key, sigma
     )
+
+
+class Case(NamedTuple):
+    """A pair of photos in a certain position: the rotation of the right one into the
+    left one, the base (mm), points in the frame of the left photo, its focal length,
+    and the standard deviation of a coordinate."""
+
+    rotation: np.ndarray
+    base: np.ndarray
+    points: np.ndarray
+    focal: float = 70.0
+    sigma: float = 0.01
+
+    def measure(self, sigma: float | None = None, seed: int = 0) -> Pair:
+        """The pair with normal errors, of another standard deviation if given."""
+        right = (self.points - self.base) @ self.rotation
+        exact = [
+            -self.focal * image[:, axis] / image[:, 2]
+            for image in (self.points, right)
+            for axis in (0, 1)
+        ]
+        errors = np.random.default_rng(seed).normal(size=(4, len(self.points)))
+        size = self.sigma if sigma is None else sigma
+        return pair(
+            *(c + size * e for c, e in zip(exact, errors, strict=True)),
+            focal=self.focal,
+        )
+
+    @property
+    def pose(self) -> RelativePose:
+        """The true pose."""
+        return pose_of(self.rotation, self.base)
+
+    def swap(self) -> "Case":
+        """The same photos, left and right exchanged."""
+        points = (self.points - self.base) @ self.rotation
+        back = -self.base @ self.rotation
+        return self._replace(rotation=self.rotation.T, base=back, points=points)
+
+    def turn_left(self, turn: np.ndarray) -> "Case":
+        """The same photos with the left one turned."""
+        return self._replace(
+            rotation=turn @ self.rotation,
+            base=turn @ self.base,
+            points=self.points @ turn.T,
+        )
+
+
+def pose_of(rotation: np.ndarray, base: np.ndarray) -> RelativePose:
+    """The pose of a rotation and a base of any length."""
+    quaternion = rotations.to_quaternion(rotations.as_matrix(jnp.asarray(rotation)))
+    return RelativePose(*quaternion, *jnp.asarray(base / np.linalg.norm(base)))
+
+
+def _overlap(focal: float = 70.0) -> np.ndarray:
+    """Sixteen points in the overlap of two photos 70 mm apart, with relief."""
+    rng = np.random.default_rng(7)
+    x, y = np.meshgrid([0.0, 23.0, 47.0, 70.0], [-60.0, -20.0, 20.0, 60.0])
+    height = rng.uniform(-0.15, 0.15, 16) * focal - focal
+    return np.stack([x.ravel(), y.ravel(), height], axis=1) + rng.uniform(
+        -4, 4, (16, 3)
+    )
+
+
+_TILT = oracles.wolf(0.03, -0.05, 0.04)
+_BASE = np.array([70.0, 2.0, -3.0])
+_NEAR = Case(_TILT, _BASE, _overlap())
+CASES = {
+    "near-vertical": _NEAR,
+    "convergent": Case(oracles.wolf(0.02, -0.7, 0.05), _BASE, _overlap()),
+    "swapped": _NEAR.swap(),
+    "upside down": Case(_TILT @ oracles.r3(np.pi), _BASE, _overlap()),
+    "narrow angle": Case(_TILT, _BASE, _overlap(700.0), focal=700.0, sigma=0.001),
+}
+"""Photos in the positions that every law holds for, by name."""
 
 
 def read(path: Path, focal: float) -> Pair:

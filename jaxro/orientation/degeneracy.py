@@ -121,7 +121,7 @@ def _bend(pair: Pair, elements: AbstractElements, direction: list) -> tuple:
     bending = rot.product(turning, rot.product(rot.transpose(rotation), turning))
     f = fundamental(rotation, base)
     slope = _plus(fundamental(turning, base), fundamental(rotation, moving))
-    twice = fundamental(turning, rot.scale(moving, 2))
+    twice = fundamental(turning, rot.scale(moving, 2.0))
     return f, slope, _plus(fundamental(bending, base), twice)
 
 

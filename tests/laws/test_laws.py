@@ -53,6 +53,11 @@ heavy_kind = pytest.mark.parametrize(
 """The same, half of them left out where each compiles programs of its own."""
 
 
+every_case = pytest.mark.parametrize(
+    "case", problems.CASES.values(), ids=problems.CASES
+)
+
+
 def oriented(measured, system=RelativePose, base=BASE, **keywords):
     """Compiled once per kind; the general start has its laws in test_any_position."""
     keywords = {"start": starts.Vertical()} | keywords
@@ -61,10 +66,30 @@ def oriented(measured, system=RelativePose, base=BASE, **keywords):
     )
 
 
+def solved(case, system=RelativePose, *, measured=None, scale=1.0, **keywords):
+    """A case from its true pose, which is an argument: one program for all cases."""
+    measured = case.measure() if measured is None else measured
+    base = scale * base_of(case, system)
+    return oriented(measured, system, base=base, start=case.pose, **keywords)
+
+
+def base_of(case, system):
+    """The length that is given of the base; bx of dependent elements has its sign."""
+    return BASE * (np.sign(case.base[0]) if system is DependentElements else 1.0)
+
+
 def numbers(elements):
     """All fields of the elements as one array (for RelativePose quaternion and
     base)."""
     return np.array([np.asarray(leaf) for leaf in jax.tree.leaves(elements)])
+
+
+def same_elements(first, second, atol):
+    """Every element the same; quaternions up to their common sign."""
+    one, two = numbers(first), numbers(second)
+    if isinstance(first, RelativePose):
+        one[:4] *= np.sign(one[:4] @ two[:4])
+    np.testing.assert_allclose(one, two, atol=atol)
 
 
 def close(first, second, atol):
@@ -92,23 +117,20 @@ def v(orientation, measured):
     return np.stack(corrections(orientation, measured))
 
 
+@every_case
 @every_kind
-def test_photo_swap(system, residual):
+def test_photo_swap(case, system, residual):
     """Left and right exchanged: R' = Rᵀ, b' = -Rᵀ b, the corrections change places, the
     accuracy stays."""
-    measured = problems.tilted()
-    one = oriented(measured, residual=residual)
-    back = -BASE if system is DependentElements else BASE
-    two = oriented(swapped(measured), system, base=back, residual=residual)
+    measured, other = case.measure(), case.swap()
+    one = solved(case, residual=residual)
+    two = solved(other, system, measured=swapped(measured), residual=residual)
     two.check()
     if residual is coplanarity.rigorous:
-        r, b = problems.rotation_base(one.pose)
-        inverse = RelativePose(
-            *rotations.to_quaternion(rotations.as_matrix(jnp.asarray(r.T))),
-            *jnp.asarray(-r.T @ b),
-        )
+        inverse = problems.pose_of(*inverted(one.pose))
+        back = base_of(other, system)
         expected = convert(inverse, system, jnp.asarray(back))
-        np.testing.assert_allclose(numbers(two.elements), numbers(expected), atol=1e-9)
+        same_elements(two.elements, expected, 1e-9)
         np.testing.assert_allclose(two.sigma0, one.sigma0, rtol=1e-9)
         np.testing.assert_allclose(two.redundancy, one.redundancy, atol=1e-9)
         np.testing.assert_allclose(
@@ -118,7 +140,8 @@ def test_photo_swap(system, residual):
         # the frame parallel to the base is level with the left photo, so the parallaxes
         # are others by its cross tilt
         turn, shift = problems.difference(two.pose, *inverted(one.pose))
-        assert turn < 1e-4 and shift < 1e-4
+        limit = 1e-4 if case.rotation[2, 2] > 0.9 else 1e-3
+        assert turn < limit and shift < limit
 
 
 def inverted(pose):
@@ -126,15 +149,17 @@ def inverted(pose):
     return r.T, -r.T @ b
 
 
+@every_case
 @every_system
-def test_scale(system):
+def test_scale(case, system):
     """Coordinates and focal lengths in another unit: angles stay, lengths follow,
     redundancy numbers stay."""
-    measured = problems.tilted()
+    measured = case.measure()
     larger = pair(
         *(3.0 * c for c in measured.coordinates), focal=3.0 * measured.focal_left
     )
-    one, two = oriented(measured, system), oriented(larger, system, base=3.0 * BASE)
+    one = solved(case, system)
+    two = solved(case, system, measured=larger, scale=3.0)
     lengths = np.array([3.0 if not angle else 1.0 for angle in system.angles])
     values = [np.array(o.elements.values()) for o in (one, two)]
     np.testing.assert_allclose(values[1], values[0] * lengths, atol=1e-9)
@@ -160,36 +185,46 @@ def bundle_turned(measured, turn):
     return pair(x, y, measured.x_right, measured.y_right, focal=measured.focal_left)
 
 
+@every_case
 @every_kind
-def test_model_rotation(system, residual):
+def test_model_rotation(case, system, residual):
     """Errorless: the left bundle turned by Q gives R' = Q R, b' = Q b."""
     turn = oracles.wolf(0.05, -0.1, 0.2)
-    measured = problems.tilted(sigma=0.0)
-    r, b = problems.rotation_base(oriented(measured, system, residual=residual).pose)
-    found = oriented(bundle_turned(measured, turn), system, residual=residual)
+    measured = case.measure(sigma=0.0)
+    one = solved(case, system, measured=measured, residual=residual)
+    other = case.turn_left(turn)
+    seen = bundle_turned(measured, turn)
+    found = solved(other, system, measured=seen, residual=residual)
+    r, b = problems.rotation_base(one.pose)
     assert max(problems.difference(found.pose, turn @ r, turn @ b)) < 1e-9
 
 
-def test_turn_in_the_photo_plane():
+@every_case
+def test_turn_in_the_photo_plane(case):
     """With errors: turned about the photo axis the accuracy of a coordinate is the
     same, so everything is."""
     turn = oracles.r3(0.3)
-    measured = problems.tilted()
-    one, two = oriented(measured), oriented(bundle_turned(measured, turn))
+    one = solved(case)
+    seen = bundle_turned(case.measure(), turn)
+    two = solved(case.turn_left(turn), measured=seen)
     r, b = problems.rotation_base(one.pose)
     assert max(problems.difference(two.pose, turn @ r, turn @ b)) < 1e-9
     np.testing.assert_allclose(two.sigma0, one.sigma0, rtol=1e-9)
     np.testing.assert_allclose(two.redundancy, one.redundancy, atol=1e-9)
 
 
+@every_case
 @every_kind
-def test_point_order(system, residual):
-    measured = problems.tilted()
+def test_point_order(case, system, residual):
+    measured = case.measure()
     order = np.random.default_rng(0).permutation(16)
     shuffled = pair(
         *(c[order] for c in measured.coordinates), focal=measured.focal_left
     )
-    one, two = (oriented(p, system, residual=residual) for p in (measured, shuffled))
+    one, two = (
+        solved(case, system, measured=p, residual=residual)
+        for p in (measured, shuffled)
+    )
     np.testing.assert_allclose(numbers(two.elements), numbers(one.elements), atol=1e-10)
     np.testing.assert_allclose(two.cofactor, one.cofactor, rtol=1e-7, atol=1e-14)
     for name in ("parallax", "residuals", "redundancy"):
@@ -202,12 +237,13 @@ def test_point_order(system, residual):
         np.testing.assert_allclose(b, a[order], atol=1e-6)
 
 
+@every_case
 @every_kind
-def test_padding(system, residual):
-    measured = problems.tilted()
+def test_padding(case, system, residual):
+    measured = case.measure()
     one, two = (
-        oriented(measured, system, residual=residual),
-        oriented(pad(measured, 23), system, residual=residual),
+        solved(case, system, measured=p, residual=residual)
+        for p in (measured, pad(measured, 23))
     )
     np.testing.assert_allclose(numbers(two.elements), numbers(one.elements), atol=1e-11)
     np.testing.assert_allclose(two.sigma0, one.sigma0, rtol=1e-9)
@@ -236,16 +272,32 @@ def test_masked_points_may_hold_anything():
 
 @every_kind
 def test_jit_is_eager(system, residual):
-    measured = problems.tilted()
-    eager = jaxro.orient(
-        measured, elements=system, base=BASE, residual=residual, start=starts.Vertical()
+    of_case = problems.jit(
+        lambda measured, pose, base: jaxro.orient(
+            measured, elements=system, base=base, residual=residual, start=pose
+        )
     )
-    close(oriented(measured, system, residual=residual), eager, 1e-10)
+    for case in problems.CASES.values():
+        inside = of_case(case.measure(), case.pose, base_of(case, system))
+        close(solved(case, system, residual=residual), inside, 1e-9)
 
 
 @heavy_kind
 def test_vmap_is_a_loop(system, residual):
+    """Of near-vertical photos from the vertical, of all others from their poses."""
     pairs = [problems.tilted(seed=seed) for seed in range(4)]
+    cases = list(problems.CASES.values())
+    of_one = lambda p, pose, base: problems.orient(
+        p, elements=system, base=base, residual=residual, start=pose
+    )
+    poses = jax.tree.map(lambda *a: jnp.stack(a), *(case.pose for case in cases))
+    bases = jnp.array([base_of(case, system) for case in cases])
+    measured = stack([case.measure() for case in cases])
+    of_cases = problems.jit(jax.vmap(of_one))(measured, poses, bases)
+    for i, case in enumerate(cases):
+        alone = solved(case, system, residual=residual)
+        close(jax.tree.map(lambda leaf, i=i: leaf[i], of_cases), alone, 1e-9)
+
     together = problems.jit(jax.vmap(lambda p: oriented(p, system, residual=residual)))(
         stack(pairs)
     )
