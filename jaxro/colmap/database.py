@@ -6,25 +6,24 @@ b, a < b their numbers; the two columns of its matches are places among the keyp
 a and of b, from zero. Matrices are nine doubles row by row, qvec is (w, x, y, z) and
 tvec turns and moves the frame of camera a into that of b. Columns that a version does
 not have are not written; tables that are not named here are not touched.
+
+The tables are read by sqlite3 and not by `pycolmap.Database`, which cannot leave a
+database as it is: `open` writes to the file, adds tables that are missing and converts
+older ones, and its transaction keeps what was written before an error.
 """
 
-import os
 import sqlite3
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float, Int
 
 from ..tables.fields import TableError
-from ..tables.whole import check_file
-from .cameras import MODELS, OTHERS, PhotoCamera
 
 MOST_IMAGES = 2147483647
-WAIT = 1.0
-"""Seconds to wait for a database that something else writes to."""
 NEEDED = {
     "cameras": ("camera_id", "model", "params", "prior_focal_length"),
     "images": ("image_id", "name", "camera_id"),
@@ -33,6 +32,15 @@ NEEDED = {
     "two_view_geometries": ("pair_id", "rows", "cols", "data", "config"),
 }
 """Tables and columns without which nothing can be done."""
+MATRICES = ("F", "E", "H", "qvec", "tvec")
+"""Columns of two_view_geometries that not every version has."""
+
+MODELS = {
+    int(model): name
+    for name, model in pycolmap.CameraModelId.__members__.items()
+    if name != "INVALID"
+}
+"""The camera models by their number in the database."""
 
 Matches = Int[np.ndarray, "_ 2"]
 
@@ -71,26 +79,15 @@ class Database:
         self._columns = {table: self._columns_of(table) for table in NEEDED}
 
     def _columns_of(self, table: str) -> list[str]:
-        found = [
-            row[1] for row in self._connection.execute(f"PRAGMA table_info({table})")
-        ]
-        missing = [column for column in NEEDED[table] if column not in found]
+        rows = self._connection.execute(f"PRAGMA table_info({table})")
+        found = [row[1] for row in rows]
         if not found:
-            raise self.error(
-                table,
-                None,
-                None,
-                "no such table",
-                "a database made by COLMAP 3 or later",
-            )
-        if missing:
-            raise self.error(
-                table,
-                None,
-                missing[0],
-                "no such column",
-                f"the columns {', '.join(NEEDED[table])}",
-            )
+            expected = "a database made by COLMAP 3 or later"
+            raise self.error(table, None, None, "no such table", expected)
+        for column in NEEDED[table]:
+            if column not in found:
+                expected = f"the columns {', '.join(NEEDED[table])}"
+                raise self.error(table, None, column, "no such column", expected)
         return found
 
     def error(
@@ -98,110 +95,136 @@ class Database:
     ) -> TableError:
         """What is wrong, and where."""
         place = ", ".join([str(self.file), f"table {table}", *([row] if row else [])])
-        return TableError(place, column=column, found=found, expected=expected)
+        return TableError(place, found=found, expected=expected, column=column)
 
-    def _rows(
-        self, table: str, columns: tuple[str, ...], order: str
-    ) -> Iterator[tuple]:
-        return iter(
-            self._connection.execute(
-                f"SELECT {', '.join(columns)} FROM {table} ORDER BY {order}"
-            )
-        )
-
-    def cameras(self) -> dict[int, PhotoCamera]:
-        """Cameras by number; models that are not understood have no parameters."""
-        return {
-            number: self._camera(number, *rest)
-            for number, *rest in self._rows("cameras", NEEDED["cameras"], "1")
-        }
-
-    def _camera(
-        self, number: int, model: int, params: bytes | None, known: int
-    ) -> PhotoCamera:
-        if model not in MODELS:
-            return PhotoCamera(OTHERS.get(model, f"number {model}"), {}, bool(known))
-        name, names = MODELS[model]
-        row = f"camera_id {number}"
-        values = self._array(
-            "cameras", row, "params", params, np.dtype("<f8"), len(names), f"{name} has"
-        )
-        parameters = dict(zip(names, map(float, values), strict=True))
-        camera = PhotoCamera(name, parameters, bool(known))
-        if not (np.all(np.isfinite(values)) and min(camera.focals) > 0):
-            raise self.error(
-                "cameras",
-                row,
-                "params",
-                str(parameters),
-                "finite numbers, the focal length positive",
-            )
-        return camera
-
-    def images(self) -> dict[int, Image]:
-        """Images by number."""
-        return {
-            number: Image(*rest)
-            for number, *rest in self._rows("images", NEEDED["images"], "1")
-        }
-
-    def keypoints(self, wanted: set[int]) -> dict[int, Float[np.ndarray, "_ 2"]]:
-        """Pixel coordinates of the keypoints of the images wanted."""
-        found = {}
-        for number, rows, cols, data in self._rows(
-            "keypoints", NEEDED["keypoints"], "1"
-        ):
-            if number in wanted:
-                if cols < 2:
-                    row = f"image_id {number}"
-                    raise self.error(
-                        "keypoints",
-                        row,
-                        "cols",
-                        str(cols),
-                        "x and y, and what describes the shape",
-                    )
-                values = self._array(
-                    "keypoints",
-                    f"image_id {number}",
-                    "data",
-                    data,
-                    np.dtype("<f4"),
-                    rows * cols,
-                    "rows x cols are",
-                )
-                found[number] = values.reshape(rows, cols)[:, :2].astype(np.float64)
-        return found
+    def _rows(self, table: str) -> Iterator[tuple]:
+        """The needed columns of all rows, in the order of their numbers."""
+        columns = ", ".join(NEEDED[table])
+        return self._connection.execute(f"SELECT {columns} FROM {table} ORDER BY 1")
 
     def pair_ids(self) -> list[tuple[int, int]]:
         """(number, number of matches) of every matched pair, in the order of the
         numbers."""
-        return list(self._rows("matches", ("pair_id", "rows"), "pair_id"))
+        query = "SELECT pair_id, rows FROM matches ORDER BY pair_id"
+        return self._connection.execute(query).fetchall()
 
-    def matches(self, pair_ids: list[int]) -> Iterator[Matches]:
-        """The matches of these pairs."""
+    def images(self, pair_ids: list[int]) -> dict[int, Image]:
+        """The images of these pairs by number. Raises TableError where one is
+        missing."""
+        known = {number: Image(*rest) for number, *rest in self._rows("images")}
+        found = {}
+        for pair_id in pair_ids:
+            for number in images_of(pair_id):
+                if number not in known:
+                    row, expected = (
+                        f"pair_id {pair_id}",
+                        "an image of the table images; match the images again",
+                    )
+                    raise self.error("matches", row, None, f"image {number}", expected)
+                found[number] = known[number]
+        return found
+
+    def cameras(
+        self, images: Mapping[int, Image], assume_calibrated: bool
+    ) -> dict[int, pycolmap.Camera]:
+        """The cameras of these images by number, in the order of the numbers. Raises
+        TableError where one is missing, not understood, or has a focal length that is
+        only guessed, unless it is to be taken as calibrated."""
+        rows = {number: rest for number, *rest in self._rows("cameras")}
+        for number, image in images.items():
+            if image.camera not in rows:
+                row, expected = _row_of(number, image), "a camera of the table cameras"
+                raise self.error(
+                    "images", row, "camera_id", str(image.camera), expected
+                )
+        wanted = sorted({image.camera for image in images.values()})
+        found = {number: self._camera(number, *rows[number]) for number in wanted}
+        for number, camera in found.items():
+            if not (camera.has_prior_focal_length or assume_calibrated):
+                row, expected = (
+                    f"camera_id {number}",
+                    "1: a focal length that is known; calibrate, or give "
+                    "--assume-calibrated if it is good to 1 %",
+                )
+                raise self.error("cameras", row, "prior_focal_length", "0", expected)
+        return found
+
+    def _camera(
+        self, number: int, model: int, params: bytes | None, known: int
+    ) -> pycolmap.Camera:
+        row = f"camera_id {number}"
+        if model not in MODELS:
+            expected = (
+                f"one of {', '.join(f'{k} {v}' for k, v in MODELS.items())}; a later "
+                "pycolmap may know it, or undistort the images first"
+            )
+            raise self.error("cameras", row, "model", str(model), expected)
+        camera = pycolmap.Camera(
+            model=MODELS[model], has_prior_focal_length=bool(known)
+        )
+        names = [name.strip() for name in camera.params_info.split(",")]
+        why = f"{MODELS[model]} has"
+        values = self._array("cameras", row, "params", params, "<f8", len(names), why)
+        camera.params = values.tolist()
+        lengths = camera.focal_length_idxs() or [0, 1]  # width, height of a panorama
+        if not (np.all(np.isfinite(values)) and np.all(values[lengths] > 0)):
+            found = str(dict(zip(names, values.tolist(), strict=True)))
+            expected = "finite numbers, the focal length positive"
+            raise self.error("cameras", row, "params", found, expected)
+        return camera
+
+    def keypoints(
+        self, images: Mapping[int, Image]
+    ) -> dict[int, Float[np.ndarray, "_ 2"]]:
+        """Pixel coordinates of the keypoints of these images. Raises TableError."""
+        found = {}
+        for number, rows, cols, data in self._rows("keypoints"):
+            if number not in images:
+                continue
+            row = f"image_id {number}"
+            if cols < 2:
+                expected = "x and y, and what describes the shape"
+                raise self.error("keypoints", row, "cols", str(cols), expected)
+            values = self._array(
+                "keypoints", row, "data", data, "<f4", rows * cols, "rows x cols are"
+            )
+            found[number] = values.reshape(rows, cols)[:, :2].astype(np.float64)
+        for number, image in images.items():
+            if number not in found:
+                row, expected = (
+                    _row_of(number, image),
+                    "the keypoints of a matched image",
+                )
+                raise self.error("keypoints", row, None, "no such row", expected)
+        return found
+
+    def matches(
+        self, pair_ids: Collection[int], keypoints: Mapping[int, int]
+    ) -> Iterator[Matches]:
+        """The matches of these pairs; `keypoints`: how many an image has. Raises
+        TableError, also where a match names one that does not exist."""
+        query = "SELECT rows, cols, data FROM matches WHERE pair_id = ?"
         for number in pair_ids:
-            query = "SELECT rows, cols, data FROM matches WHERE pair_id = ?"
             rows, cols, data = self._connection.execute(query, (number,)).fetchone()
             row = f"pair_id {number}"
             if rows and cols != 2:
-                raise self.error(
-                    "matches",
-                    row,
-                    "cols",
-                    str(cols),
-                    "2, the places of a keypoint in either image",
-                )
+                expected = "2, the places of a keypoint in either image"
+                raise self.error("matches", row, "cols", str(cols), expected)
             values = self._array(
-                "matches",
-                row,
-                "data",
-                data,
-                np.dtype("<u4"),
-                rows * 2,
-                "rows x cols are",
+                "matches", row, "data", data, "<u4", rows * 2, "rows x cols are"
             )
-            yield values.astype(np.int64).reshape(rows, 2)
+            found = values.astype(np.int64).reshape(rows, 2)
+            largest = found.max(axis=0, initial=-1)
+            for image, place in zip(images_of(number), largest, strict=True):
+                if place >= keypoints[image]:
+                    expected = (
+                        f"places below {keypoints[image]}, the number of keypoints of "
+                        f"image {image}"
+                    )
+                    raise self.error(
+                        "matches", row, "data", f"keypoint {place}", expected
+                    )
+            yield found
 
     def _array(
         self,
@@ -209,147 +232,44 @@ class Database:
         row: str,
         column: str,
         data: bytes | None,
-        dtype: np.dtype,
+        dtype: str,
         count: int,
         why: str,
-    ):
+    ) -> np.ndarray:
+        """The numbers of a blob. Raises TableError unless it has so many."""
         if isinstance(data, str):
             raise self.error(table, row, column, "text", "bytes")
-        size = len(data or b"")
-        if size != count * dtype.itemsize:
-            expected = (
-                f"{count * dtype.itemsize} bytes: {why} {count} numbers of "
-                f"{dtype.itemsize} bytes"
-            )
+        size, each = len(data or b""), np.dtype(dtype).itemsize
+        if size != count * each:
+            expected = f"{count * each} bytes: {why} {count} numbers of {each} bytes"
             raise self.error(table, row, column, f"{size} bytes", expected)
         return np.frombuffer(data or b"", dtype)
 
     def geometries(self) -> int:
         """How many two-view geometries there are."""
-        return self._connection.execute(
-            "SELECT count(*) FROM two_view_geometries"
-        ).fetchone()[0]
+        query = "SELECT count(*) FROM two_view_geometries"
+        return self._connection.execute(query).fetchone()[0]
 
     def write(self, geometries: list[Geometry]) -> None:
         """Rows of two_view_geometries, in place of those of the same pairs."""
-        known = [
-            c
-            for c in ("F", "E", "H", "qvec", "tvec")
-            if c in self._columns["two_view_geometries"]
-        ]
-        columns = [*NEEDED["two_view_geometries"], *known]
-        places = ", ".join("?" * len(columns))
-        rows = [
-            (
-                g.pair_id,
-                len(g.matches),
-                2,
-                g.matches.astype("<u4").tobytes() or None,
-                g.config,
-                *(_blob(getattr(g, c)) for c in known),
-            )
-            for g in geometries
-        ]
-        command = (
-            f"INSERT OR REPLACE INTO two_view_geometries ({', '.join(columns)}) VALUES "
-            f"({places})"
+        known = self._columns["two_view_geometries"]
+        matrices = [name for name in MATRICES if name in known]
+        columns = [*NEEDED["two_view_geometries"], *matrices]
+        rows = []
+        for one in geometries:
+            matches = one.matches.astype("<u4").tobytes() or None
+            blobs = [_blob(getattr(one, name)) for name in matrices]
+            rows.append((one.pair_id, len(one.matches), 2, matches, one.config, *blobs))
+        self._connection.executemany(
+            f"INSERT OR REPLACE INTO two_view_geometries ({', '.join(columns)}) "
+            f"VALUES ({', '.join('?' * len(columns))})",
+            rows,
         )
-        self._connection.executemany(command, rows)
+
+
+def _row_of(number: int, image: Image) -> str:
+    return f"image_id {number} ({image.name})"
 
 
 def _blob(values: np.ndarray | None) -> bytes | None:
     return None if values is None else np.ascontiguousarray(values, "<f8").tobytes()
-
-
-@contextmanager
-def opened(file: Path, out: Path | None, force: bool) -> Iterator[Database]:
-    """The database, or a copy of it at `out`, in a transaction that takes effect when
-    the block ends without an error; after one nothing is changed. Raises TableError."""
-    if not file.is_file():
-        raise TableError(
-            file, found="no such file", expected="a COLMAP database; check the path"
-        )
-    if out is not None and out.absolute() == file.absolute():
-        out = None
-    if out is None:
-        with (
-            _said(file),
-            closing(_connection(file)) as connection,
-            _transaction(connection, file) as database,
-        ):
-            _refuse(database, force)
-            yield database
-        return
-    check_file(out, force)
-    draft = out.absolute().with_name(f".{out.name}.{os.getpid()}.partial")
-    try:
-        with _said(file, out):
-            draft.parent.mkdir(parents=True, exist_ok=True)
-            with closing(_connection(draft)) as connection:
-                # a draft that is not finished is thrown away: it needs no journal, and
-                # the disk waits until it is
-                connection.execute("PRAGMA journal_mode = MEMORY")
-                connection.execute("PRAGMA synchronous = OFF")
-                with _said(file), closing(_connection(file)) as source:
-                    source.execute(
-                        "SELECT count(*) FROM sqlite_master"
-                    )  # waits for a lock for a while, a backup for ever
-                    source.backup(connection)
-                with _transaction(connection, file) as database:
-                    _refuse(database, force)
-                    yield database
-        with _said(out):
-            with draft.open("r+b") as finished:
-                os.fsync(finished.fileno())
-            os.replace(draft, out)
-    finally:
-        for end in ("", "-wal", "-shm", "-journal"):
-            with suppress(OSError):
-                draft.with_name(draft.name + end).unlink(missing_ok=True)
-
-
-def _connection(path: Path) -> sqlite3.Connection:
-    return sqlite3.connect(path, timeout=WAIT, isolation_level=None)
-
-
-@contextmanager
-def _transaction(connection: sqlite3.Connection, name: Path) -> Iterator[Database]:
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        yield Database(name, connection)
-        connection.execute("COMMIT")
-    finally:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-
-
-@contextmanager
-def _said(file: Path, written: Path | None = None) -> Iterator[None]:
-    """What SQLite and the disk complain of, as an error that says what to do;
-    `written`: the copy, if there is one."""
-    try:
-        yield
-    except sqlite3.OperationalError as error:
-        expected = (
-            "a database that nothing else writes to, in a folder that can be written; "
-            "or --out for a copy"
-        )
-        raise TableError(written or file, found=str(error), expected=expected) from None
-    except sqlite3.DatabaseError as error:
-        raise TableError(
-            file, found=str(error), expected="a sound SQLite database made by COLMAP"
-        ) from None
-    except OSError as error:
-        found = error.strerror or str(error)
-        raise TableError(
-            written or file, found=found, expected="a file that can be written"
-        ) from None
-
-
-def _refuse(database: Database, force: bool) -> None:
-    count = database.geometries()
-    if count and not force:
-        found = f"{count} two-view geometries"
-        raise database.error(
-            "two_view_geometries", None, None, found, "none, or --force to replace them"
-        )

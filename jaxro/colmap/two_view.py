@@ -1,231 +1,84 @@
-"""What the orientation of an image pair from its automatic matches is worth.
+"""COLMAP's two-view geometry of an oriented pair: configuration and matrices.
 
-Pose and kept matches are those of the procedure `recommended`, unchanged where the pair
-is `oriented`. What is told here besides is what they mean:
+With D = diag(1, -1, -1) (`cameras`) a pose R, b of jaxro is in COLMAP's frames
 
-1. Where most matches lie in one plane, they have a second pose (`planes`), which
-   replaces the first one if it has more of them in front of both photos.
-2. Where the rotation alone explains the matches, there is no base, and whatever base
-   was found is an accident.
-3. Matches that repeat others are no evidence, and of automatic matches some are wrong
-   from the start: that all of them fit proves nothing if they are few. The kept set is
-   believed if sets as good are not expected by accident (`rejection.evidence`), by the
-   share of matches that agree when every point is given the partner of another one.
+    cam2_from_cam1:  R' = D Rᵀ D,  t = -R' D b,    E = [t]x R',
+    F = K2⁻ᵀ E K1⁻¹,    H = K2 (R' + t (D n)ᵀ) K1⁻¹
+
+b of unit length, n · X = 1 the plane. F and H hold for keypoints free of distortion.
 """
 
-import enum
-import math
-from typing import NamedTuple
+from collections.abc import Sequence
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Float
 
-from ..adjustment import critical_values
-from ..geometry import rotations as rot
-from ..geometry.elements import RelativePose
-from ..geometry.pairs import Pair, mask_unusable
-from ..orientation import planes
-from ..orientation.results import RESULTS, is_usable
-from ..orientation.starts.general import rotation_only
-from ..rejection import OUTCOMES, Recommended, Rejection, evidence
-from ..rejection.hypotheses import squares, vectors
-from ..rejection.robust import agreeing, in_front, parallel, seen
-from ..xla.kernels import while_loop
-from ..xla.passes import count, total
+from ..rejection.classification import Found, Kind
+from .database import Geometry, Matches
 
-ENGINE = Recommended()
-"""The procedure that decides on pose and matches; the standard deviations are those of
-the matches."""
+CONFIG = {
+    Kind.oriented: 2,
+    Kind.plane: 4,
+    Kind.rotation: 5,
+    Kind.weak: 2,
+    Kind.no_consensus: 1,
+    Kind.too_few: 1,
+}
+"""COLMAP's number: CALIBRATED 2, PLANAR 4, PANORAMIC 5, DEGENERATE 1."""
 
-ACCIDENTS = 1e-3
-"""Sets as good that may be expected by accident: as many as the engine allows."""
+CONTENT = {
+    Kind.oriented: ("F", "E", "qvec", "tvec"),
+    Kind.plane: ("F", "E", "H"),
+    Kind.rotation: ("H", "qvec", "tvec"),
+    Kind.weak: ("F", "E"),
+    Kind.no_consensus: (),
+    Kind.too_few: (),
+}
+"""What is written of a pair besides its matches: no pose of a plane, which may have
+two, nor where the base is too short for its errors."""
 
-ROUNDS = 10
-"""Turns of least squares and judgement for the second pose of a plane scene."""
-
-TURNS = 3
-"""Of the rotation without a base, each by the matches that the last one takes along."""
-
-ALIKE, CHANCE = 3.0, 0.05
-"""Wrong matches that agree on a base chosen for them, and the share of the others that
-agree by chance."""
-
-PLANE = 0.8
-"""Share of the matches that agree with a pose from which on the plane they lie in alone
-determines it."""
+Matrices = Float[np.ndarray, "pair 3 3"]
 
 
-class Kind(enum.IntEnum):
-    """How the orientation of a pair from its matches ended."""
-
-    oriented = 0
-    plane = 1
-    rotation = 2
-    weak = 3
-    no_consensus = 4
-    too_few = 5
-
-
-class Found(eqx.Module):
-    """Matches kept, the pose by them (w, x, y, z; R; unit base), n of the plane n · λ
-    p1 / f1 = 1 nearest to them, and what that is worth: sigma0 and the number of a
-    `Kind`."""
-
-    kept: Bool[Array, "*pairs match"]
-    quaternion: Float[Array, "*pairs 4"]
-    rotation: Float[Array, "*pairs 3 3"]
-    base: Float[Array, "*pairs 3"]
-    normal: Float[Array, "*pairs 3"]
-    sigma0: Float[Array, "*pairs"]
-    kind: Int[Array, "*pairs"]
-
-
-class Verdict(NamedTuple):
-    """What the engine says of a pair: matches kept, the pose by them and how that
-    ended, and the outcome."""
-
-    mask: Bool[Array, "*pairs match"]
-    pose: RelativePose
-    result: RESULTS
-    outcome: OUTCOMES
-
-
-class Plane(NamedTuple):
-    """The pose of most matches in front of both photos, its matches, the plane nearest
-    to them, and whether that plane alone determines the pose."""
-
-    pose: RelativePose
-    use: Bool[Array, "match"]
-    normal: Float[Array, "3"]
-    alone: Bool[Array, ""]
-
-
-def verdict(rejection: Rejection) -> Verdict:
-    """The part of a rejection that is needed here."""
-    solved = rejection.orientation
-    return Verdict(rejection.mask, solved.pose, solved.result, rejection.outcome)
-
-
-def classified(pair: Pair, verdict: Verdict) -> Found:
-    """What the verdict of the engine on a pair is worth."""
-    pair = mask_unusable(pair)[0]
-    each = lambda n: critical_values.normal(ENGINE.level / jnp.maximum(n, 1.0))
-    limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
-    plane = in_plane(pair, verdict.pose, verdict.mask, limit)
-    pose, use, turned = without_base(pair, plane.pose, plane.use, verdict.result, limit)
-    weak = verdict.result == RESULTS.weakly_determined
-    # what lies behind a photo here is infinitely far for its errors
-    fair = (
-        is_usable(verdict.result)
-        | weak
-        | (verdict.result == RESULTS.points_behind_camera)
-    )
-    # any base is as good as another one where there is none, so that the engine may
-    # well doubt the one it found
-    convinced = turned | (fair & (verdict.outcome != OUTCOMES.no_consensus))
-    kind = jnp.where(plane.alone, int(Kind.plane), int(Kind.oriented))
-    for holds, other in (
-        (weak & ~plane.alone, Kind.weak),
-        (turned, Kind.rotation),
-        (~convinced | ~certain(pair, pose, use, limit), Kind.no_consensus),
-        (count(pair.mask) < 6, Kind.too_few),
-    ):
-        kind = jnp.where(holds, int(other), kind)
-    return Found(
-        kept=use & (kind < int(Kind.no_consensus)),
-        quaternion=pose.quaternion,
-        rotation=rot.as_array(pose.relative()[0]),
-        base=pose.base,
-        normal=plane.normal,
-        sigma0=sigma0(pair, pose, use),
-        kind=kind,
-    )
-
-
-def in_plane(
-    pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit: Float[Array, ""]
-) -> Plane:
-    """Whether most matches lie in one plane; if so the second pose in place of the
-    first one, with the matches that agree with it, where it has more of them in front
-    of both photos."""
-    # those, too, that were rejected for lying behind a photo
-    agree = use | (pair.mask & (squares(pair, pose) <= limit**2))
-    flat = planes.plane(pair, pose, agree, limit)
-    alone = flat.share >= PLANE
-
-    def once(state):
-        needed, first = state
-        # depends on the round, or it would be computed of every scene
-        inside = mask_unusable(pair.with_mask(pair.mask & needed))[0]
-        other, exists = planes.second(
-            inside.with_mask(inside.mask & flat.within), pose, flat.normal
+def geometries(
+    pair_ids: Sequence[int],
+    matches: Sequence[Matches],
+    found: Found,
+    k1: Matrices,
+    k2: Matrices,
+) -> list[Geometry]:
+    """The rows of two_view_geometries of these pairs; k1, k2: the matrices of their
+    cameras."""
+    columns = matrices(found, k1, k2)
+    rows = []
+    for i, (pair_id, given) in enumerate(zip(pair_ids, matches, strict=True)):
+        kind = Kind(int(found.kind[i]))
+        rows.append(
+            Geometry(
+                pair_id=pair_id,
+                matches=given[found.kept[i, : len(given)]],
+                config=CONFIG[kind],
+                **{name: columns[name][i] for name in CONTENT[kind]},
+            )
         )
-        more = count(flat.within & in_front(inside, other)) > count(
-            flat.within & in_front(inside, pose)
-        )
-        other, others = agreeing(
-            inside, other, inside.mask & flat.within, limit, ROUNDS
-        )
-        others = others & seen(inside, other, limit)
-        new = Plane(
-            other, others, planes.plane(inside, other, others, limit).normal, alone
-        )
-        return needed & False, jax.tree.map(
-            lambda a, b: jnp.where(needed & exists & more, a, b), new, first
-        )
-
-    first = Plane(pose, use, flat.normal, alone)
-    return while_loop(lambda state: state[0], once, (alone, first), pair.focal_left)[1]
+    return rows
 
 
-def without_base(
-    pair: Pair,
-    pose: RelativePose,
-    use: Bool[Array, "match"],
-    result: RESULTS,
-    limit: Float[Array, ""],
-) -> tuple[RelativePose, Bool[Array, "match"], Bool[Array, ""]]:
-    """The rotation without a base and its matches where it explains the matches in use,
-    and whether it does."""
-    # a large sigma0 hides a base, too: the rays themselves have to be parallel, by the
-    # rotation alone. Without a base any will do, and then it is one that some wrong
-    # matches agree on: their parallaxes are no proof of it
-    turns = lambda _, still: parallel(
-        pair, rotation_only(*vectors(pair), use & still)[0], limit
-    )
-    still = lax.fori_loop(0, TURNS, turns, pair.mask)
-    rotated = rotation_only(*vectors(pair), use & still)[0]
-    few = count(use & ~still) <= ALIKE + CHANCE * count(pair.mask & ~still)
-    turned = ((result == RESULTS.zero_base) | few) & (
-        count(use & still) >= PLANE * count(use)
-    )
-    pose, use = jax.tree.map(
-        lambda a, b: jnp.where(turned, a, b), (rotated, still), (pose, use)
-    )
-    return pose, use, turned
-
-
-def certain(
-    pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit: Float[Array, ""]
-) -> Bool[Array, ""]:
-    """Whether so many matches, each counted once, do not agree by accident."""
-    again, _ = evidence.repeats(pair)
-    once = mask_unusable(pair.with_mask(pair.mask & ~again))[0]
-    agreed, asked = evidence.shifted_agreement(once, pose, limit)
-    chance = (agreed + 1) / (asked + 2)
-    return evidence.accidents(
-        chance, count(once.mask), count(use & once.mask)
-    ) <= math.log(ACCIDENTS)
-
-
-def sigma0(
-    pair: Pair, pose: RelativePose, use: Bool[Array, "match"]
-) -> Float[Array, ""]:
-    """The estimated standard deviation of unit weight, every match kept with its full
-    weight: that of the engine's own solution is too small where the weights fade."""
-    freedom = count(use) - 5
-    square = total(jnp.where(use, squares(pair, pose), 0.0)) / jnp.maximum(freedom, 1.0)
-    return jnp.where(freedom > 0, jnp.sqrt(square), 0.0)
+def matrices(found: Found, k1: Matrices, k2: Matrices) -> dict[str, np.ndarray]:
+    """F, E, H, qvec and tvec of every pair; without a base H and tvec are those of the
+    rotation alone."""
+    signs = np.array([1.0, -1.0, -1.0])
+    rotation = signs[:, None] * np.swapaxes(found.rotation, 1, 2) * signs
+    t = -np.einsum("pij,pj->pi", rotation, signs * found.base)
+    t = np.where((found.kind == Kind.rotation)[:, None], 0.0, t)
+    essential = np.stack([np.cross(t, rotation[:, :, k]) for k in range(3)], axis=-1)
+    k1_inverse, k2_inverse = np.linalg.inv(k1), np.linalg.inv(k2)
+    plane = t[:, :, None] * (signs * found.normal)[:, None, :]
+    return {
+        "F": np.swapaxes(k2_inverse, 1, 2) @ essential @ k1_inverse,
+        "E": essential,
+        "H": k2 @ (rotation + plane) @ k1_inverse,
+        # the inverse, turned half about x (D): of the quaternion x changes its sign
+        "qvec": np.asarray(found.quaternion) * np.array([1.0, -1.0, 1.0, 1.0]),
+        "tvec": t,
+    }

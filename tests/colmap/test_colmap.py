@@ -12,15 +12,17 @@ from typer.testing import CliRunner
 
 import jaxro
 from jaxro.cli import app
-from jaxro.colmap.cameras import MODELS, PhotoCamera, photo_points
-from jaxro.colmap.database import Database, images_of
-from jaxro.commands import colmap
 from jaxro.geometry import mock_pairs
 from jaxro.rejection import OUTCOMES, Recommended
+from jaxro.rejection.classification import Kind
 
 pycolmap = pytest.importorskip(
     "pycolmap", reason="pycolmap makes the databases and judges them"
 )
+from jaxro.colmap import two_view  # noqa: E402
+from jaxro.colmap.database import Database, images_of  # noqa: E402
+from jaxro.commands import colmap  # noqa: E402
+
 Config = pycolmap.TwoViewGeometryConfiguration
 NOISE = 0.5
 """Pixels."""
@@ -439,29 +441,6 @@ def test_poses_and_matches_are_those_of_recommended(tmp_path):
             )
 
 
-PARAMETERS = {
-    "SIMPLE_PINHOLE": [1200, 500, 400],
-    "PINHOLE": [1200, 1250, 500, 400],
-    "SIMPLE_RADIAL": [1280, 512, 384, -0.2],
-    "RADIAL": [1100, 500, 380, 0.1, -0.05],
-    "OPENCV": [1100, 1080, 505, 390, -0.28, 0.09, 0.001, -0.002],
-    "FULL_OPENCV": [
-        1100,
-        1080,
-        505,
-        390,
-        -0.3,
-        0.1,
-        0.001,
-        -0.002,
-        0.01,
-        0.05,
-        -0.02,
-        0.003,
-    ],
-}
-
-
 def test_matches_that_repeat_others_are_no_evidence(tmp_path):
     """Five matches prove nothing however often they stand there; of a sound pair
     repeats are kept with what they repeat. A geometry of a pair without matches is
@@ -495,42 +474,6 @@ def test_matches_that_repeat_others_are_no_evidence(tmp_path):
     with pycolmap.Database.open(str(path)) as database:
         assert len(database.read_two_view_geometry(*five).inlier_matches) == 0
         assert len(database.read_two_view_geometry(*sound).inlier_matches) == 80
-
-
-def camera_of(model, parameters):
-    names = next(names for name, names in MODELS.values() if name == model)
-    theirs = pycolmap.Camera(model=model, width=1024, height=768, params=parameters)
-    return PhotoCamera(
-        model, dict(zip(names, map(float, parameters), strict=True)), True
-    ), theirs
-
-
-@pytest.mark.parametrize("model", [name for name, _ in MODELS.values()])
-def test_undistortion_is_that_of_colmap(model):
-    ours, theirs = camera_of(model, PARAMETERS[model])
-    pixels = np.random.default_rng(0).uniform(0, [1024, 768], (500, 2))
-    step = 1e-4
-    found, right, down = (
-        photo_points(pixels + d, [ours], [500]) for d in ([0, 0], [step, 0], [0, step])
-    )
-    rays = theirs.cam_from_img(pixels)
-    assert np.all(found.seen)
-    np.testing.assert_allclose(np.c_[found.x, -found.y] / ours.focal, rays, atol=1e-9)
-    area = (right.x - found.x) * (down.y - found.y) - (right.y - found.y) * (
-        down.x - found.x
-    )
-    np.testing.assert_allclose(found.scale, np.sqrt(np.abs(area)) / step, rtol=1e-5)
-    assert abs(ours.focal - theirs.mean_focal_length()) < 1e-9
-    np.testing.assert_array_equal(ours.matrix, theirs.calibration_matrix())
-
-
-def test_no_ray_is_seen_beyond_the_fold():
-    """r (1 - r²/2) has its largest value .544 at r = .816."""
-    ours, _ = camera_of("SIMPLE_RADIAL", [600, 512, 384, -0.5])
-    for at, seen in ((0.54, True), (0.55, False), (np.inf, False)):
-        assert photo_points(np.array([[512 + 600 * at, 384.0]]), [ours], [1]).seen == [
-            seen
-        ]
 
 
 def change(statement, *values):
@@ -577,12 +520,13 @@ WRONG = {
         ["image_id 2", "camera_id", "9"],
     ),
     "unknown model": (
-        change("UPDATE cameras SET model = 5"),
+        change("UPDATE cameras SET model = 77"),
         [
-            "table images, image_id 1",
-            "frame",
-            "OPENCV_FISHEYE",
-            "SIMPLE_RADIAL",
+            "table cameras, camera_id 1",
+            "column model",
+            "found 77",
+            "5 OPENCV_FISHEYE",
+            "2 SIMPLE_RADIAL",
             "undistort",
         ],
     ),
@@ -649,8 +593,9 @@ def test_a_locked_database_is_told(scene, tmp_path):
 
 
 def test_every_kind_is_explained():
-    assert set(colmap.MEANING) == set(colmap.CONFIG) == set(colmap.Kind)
+    assert set(colmap.MEANING) == set(two_view.CONFIG) == set(Kind)
+    assert set(two_view.CONTENT) == set(Kind)
     names = {2: "CALIBRATED", 4: "PLANAR", 5: "PANORAMIC", 1: "DEGENERATE"}
-    for kind, config in colmap.CONFIG.items():
+    for kind, config in two_view.CONFIG.items():
         assert colmap.MEANING[kind][1].startswith(names[config])
         assert int(getattr(Config, names[config])) == config
