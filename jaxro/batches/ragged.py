@@ -17,6 +17,7 @@ from ..geometry.pairs import Pair, double, pair
 from ..orientation.result import Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..rejection import AbstractProcedure, Rejection
+from ..xla.settings import keep_plain
 from ..xla.slabs import Progress, Split, silent
 from .batch import (
     clean_slabs,
@@ -353,7 +354,8 @@ def _overlapping(work: Callable, batches: Sequence[tuple]) -> Iterator[tuple]:
     together."""
     pool = ThreadPoolExecutor(2)
     try:
-        yield from pool.map(lambda batch: work(*batch), reversed(batches))
+        one = keep_plain(lambda batch: work(*batch))
+        yield from pool.map(one, reversed(batches))
     finally:
         # who interrupts does not wait for a program to be compiled
         pool.shutdown(wait=False, cancel_futures=True)

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, PyTree
 
+from .settings import Trick, is_plain
+
 _making_kernels = jax.make_user_context(False)
 _fusing_points = jax.make_user_context(False)
 
@@ -26,11 +28,14 @@ def one_kernel(function: Callable) -> Callable:
     XLA's CPU backend compiles a program as many small ones and goes from one to the
     next at run time, which costs more than the work of a small pair.
     """
-    return kernels_of_parts(
-        lambda data, **options: _call(
-            lambda data: function(data, **options), **_AS_ONE
-        )(data)
-    )
+
+    def within(data: PyTree, **options: Any) -> PyTree:
+        with_options = lambda data: function(data, **options)
+        if is_plain(Trick.ONE_KERNEL):
+            return with_options(data)
+        return _call(with_options, **_AS_ONE)(data)
+
+    return kernels_of_parts(within)
 
 
 @lru_cache(maxsize=64)
@@ -59,7 +64,7 @@ def kernels_of_parts(function: Callable) -> Callable:
 
 def fusing_points() -> bool:
     """Whether the program that is traced is `one_kernel_fusing_points`."""
-    return _fusing_points.value
+    return _fusing_points.value and not is_plain(Trick.POINTWISE)
 
 
 def kernel_part(function: Callable) -> Callable:
@@ -68,6 +73,8 @@ def kernel_part(function: Callable) -> Callable:
 
     Elsewhere a function of its own, whose loops `vmap` batches sooner.
     """
+    if is_plain(Trick.KERNEL_PART):
+        return function
     if _making_kernels.value:
         return _call(function, **_AS_ONE)
     return eqx.filter_jit(function)
@@ -81,7 +88,7 @@ def computed_once(function: Callable) -> Callable:
     (it removes an `optimization_barrier` before it fuses). Other backends see the plain
     function.
     """
-    if jax.default_backend() != "cpu":
+    if jax.default_backend() != "cpu" or is_plain(Trick.COMPUTED_ONCE):
         return function
     return _call(function, inlineable="false")
 
@@ -94,6 +101,8 @@ def while_loop(more: Callable, turn: Callable, state: PyTree, like: Array) -> Py
     learns that one of them changes, and the loops in it as often each time. The
     compiler drops the selection.
     """
+    if is_plain(Trick.WHILE_LOOP):
+        return jax.lax.while_loop(more, turn, state)
     always = like == like
     return jax.lax.while_loop(
         more, turn, jax.tree.map(lambda a: jax.lax.select(always, a, a), state)
@@ -109,6 +118,9 @@ def if_needed(
     It is a loop of at most one turn. What `function` works on has to depend on its
     argument (a mask, say), or the compiler computes it outside of the loop.
     """
+    choose = lambda a, b: jnp.where(needed, a, b)
+    if is_plain(Trick.IF_NEEDED):
+        return jax.tree.map(choose, function(needed), otherwise)
 
     def turn(state):
         open_, value = state

@@ -1,7 +1,8 @@
 """Compiled programs of functions that have static options.
 
 A program is cached by its function and its static options (classes, modules, plain
-values), so that a second call with the same options compiles nothing.
+values), so that a second call with the same options compiles nothing. What is switched
+off by `settings.plain` is part of every key.
 """
 
 import gc
@@ -18,7 +19,15 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 from . import store
-from .settings import NO_LIBRARY_SUMS, RUN_FAST, known_settings
+from .settings import (
+    NO_LIBRARY_SUMS,
+    RUN_FAST,
+    Trick,
+    is_plain,
+    known_settings,
+    plain,
+    switched_off,
+)
 
 
 class _Key:
@@ -57,8 +66,15 @@ class Program:
         self._static = _Key(static)
         self._function = function
         self._kernel = kernel
+        self._plain = switched_off()
 
     def __call__(self, data: PyTree) -> PyTree:
+        if self._plain == switched_off():
+            return self._call(data)
+        with plain(self._plain):  # a thread that helps does not know of it
+            return self._call(data)
+
+    def _call(self, data: PyTree) -> PyTree:
         settings = *self._settings, *NO_LIBRARY_SUMS.items()
         if (
             self._kernel is not None
@@ -67,7 +83,10 @@ class Program:
         ):
             try:
                 return self._run(data, self._kernel(self._function), settings)
-            except jax.errors.JaxRuntimeError:  # sorting, say, in what a caller selects
+            except jax.errors.JaxRuntimeError as error:
+                if "RESOURCE_EXHAUSTED" in str(error):
+                    raise
+                # sorting, say, in what a caller selects
                 self._remembered["refused"] = True
         return self._run(data, self._function, self._settings)
 
@@ -78,10 +97,10 @@ class Program:
 
     @property
     def _remembered(self) -> dict[str, Any]:
-        return _remembered(self._function, self._static, self._settings)
+        return _remembered(self._function, self._static, self._settings, self._plain)
 
     def _run(self, data: PyTree, function: Callable, settings: tuple) -> PyTree:
-        key = self._function, self._static, settings
+        key = self._function, self._static, settings, self._plain
         arguments = data, self._arrays
         if store.active():
             shapes = tuple(
@@ -114,7 +133,8 @@ def jit_in_this_thread(
     disk, so that where it is to keep them this is an ordinary one.
     """
     kept = jax.config.jax_compilation_cache_dir is not None  # pyright: ignore[reportAttributeAccessIssue]
-    if kept or jax.default_backend() != "cpu":
+    threaded = is_plain(Trick.SAME_THREAD) or jax.default_backend() != "cpu"
+    if kept or threaded:
         return jax.jit(function, compiler_options=settings)
 
     def within(*arguments):
@@ -156,12 +176,14 @@ def pause_collection() -> Iterator[None]:
 
 
 @lru_cache(maxsize=64)
-def _compile(function: Callable, static: _Key, settings: tuple) -> Callable:
+def _compile(function: Callable, static: _Key, settings: tuple, off: Trick) -> Callable:
     return jit_in_this_thread(_flat(function, static), known_settings(dict(settings)))
 
 
 @lru_cache(maxsize=64)
-def _remembered(function: Callable, static: _Key, settings: tuple) -> dict[str, Any]:
+def _remembered(
+    function: Callable, static: _Key, settings: tuple, off: Trick
+) -> dict[str, Any]:
     """What is remembered of a program."""
     return {}
 

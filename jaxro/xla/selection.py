@@ -1,4 +1,4 @@
-"""What only some of many pairs need, and the others need not wait or make room for."""
+"""Run an expensive function only for those members of a batch that need it."""
 
 from collections.abc import Callable
 
@@ -6,6 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
+
+from .settings import Trick, is_plain
 
 
 def where_needed(
@@ -15,13 +17,17 @@ def where_needed(
     otherwise: PyTree,
     most: int,
 ) -> PyTree:
-    """function(data); under `vmap` of those alone that need it, `most` at a time, and
-    `otherwise` of the others.
+    """function(data) where it is needed, else `otherwise`: under `vmap` the function runs
+    only for the members that need it, `most` at a time.
 
-    For what only a few of many need, and what takes so much memory that a batch of a
-    caller's own would not fit. The function closes over no arrays and has no
-    derivatives.
+    For a function that few members need, and one that takes so much memory that a batch
+    of a caller's own would not fit. Where no more than `most` members are batched, or
+    none, what is not needed may be either. The function closes over no arrays and has
+    no derivatives.
     """
+    if is_plain(Trick.SELECTION):
+        choose = lambda a, b: jnp.where(needed, a, b)
+        return jax.tree.map(choose, function(data), otherwise)
     once = eqx.filter_closure_convert(function, data)  # traced once for both
     split = jax.custom_batching.custom_vmap(lambda needed, data, otherwise: once(data))
 

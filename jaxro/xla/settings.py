@@ -1,12 +1,71 @@
-"""Options of the compiler, and which of them this compiler knows.
+"""Options of the compiler, which of them this compiler knows, and the switch that does
+without them and all else of the seam.
 
-The names are XLA's own, and come and go with its versions.
+The names of options are XLA's own, and come and go with its versions.
 """
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from enum import Flag, auto
 from functools import lru_cache
 from typing import Any
 
 import jax
+
+
+class Trick(Flag):
+    """What the seam does otherwise than plain JAX."""
+
+    SUMS = auto()
+    POINTWISE = auto()
+    ONE_KERNEL = auto()
+    KERNEL_PART = auto()
+    COMPUTED_ONCE = auto()
+    WHILE_LOOP = auto()
+    IF_NEEDED = auto()
+    SELECTION = auto()
+    SAME_THREAD = auto()
+    FAST_MATH = auto()
+    OLD_GENERATOR = auto()
+    QUICK_COMPILE = auto()
+    OTHER_SETTINGS = auto()
+
+
+ALL = ~Trick(0)
+
+_switched_off = jax.make_user_context(Trick(0))
+
+
+def plain(tricks: Trick = ALL) -> AbstractContextManager:
+    """`with plain():` traces and compiles everything as plain JAX, or, of the tricks
+    given, without these alone. The numbers are the same to rounding.
+
+    It holds in the thread that enters it, and for the programs that are made in it, in
+    whatever thread they run. What was compiled outside of it is not used inside.
+    """
+    return _switched_off(tricks)
+
+
+def switched_off() -> Trick:
+    """The tricks that are switched off here: none, but in `plain`."""
+    return _switched_off.value
+
+
+def is_plain(trick: Trick) -> bool:
+    """Whether a trick is switched off here."""
+    return trick in _switched_off.value
+
+
+def keep_plain(function: Callable) -> Callable:
+    """The function for another thread, where the same is switched off as here."""
+    off = switched_off()
+
+    def within(*arguments):
+        with plain(off):
+            return function(*arguments)
+
+    return within
+
 
 RUN_FAST = {
     "xla_cpu_enable_fast_math": True,
@@ -42,12 +101,25 @@ NO_LIBRARY_SUMS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
 
 def known_settings(settings: dict[str, Any]) -> dict[str, Any] | None:
-    """The settings that the compiler knows, as `jax.jit` takes them."""
-    return _known_items(tuple(settings.items()))
+    """The settings that the compiler knows, as `jax.jit` takes them; those that are
+    switched off are left out."""
+    return _known_items(tuple(settings.items()), switched_off())
+
+
+def _trick_of(name: str) -> Trick:
+    """The trick that an option of the compiler belongs to."""
+    if "fast_math" in name:
+        return Trick.FAST_MATH
+    return {
+        "xla_cpu_use_fusion_emitters": Trick.OLD_GENERATOR,
+        "xla_backend_optimization_level": Trick.QUICK_COMPILE,
+    }.get(name, Trick.OTHER_SETTINGS)
 
 
 @lru_cache
-def _known_items(items: tuple[tuple[str, Any], ...]) -> dict[str, Any] | None:
+def _known_items(
+    items: tuple[tuple[str, Any], ...], off: Trick
+) -> dict[str, Any] | None:
     if jax.default_backend() != "cpu":
         return None
 
@@ -58,4 +130,5 @@ def _known_items(items: tuple[tuple[str, Any], ...]) -> dict[str, Any] | None:
             return False
         return True
 
-    return dict(items if has(*items) else filter(has, items)) or None
+    wanted = [item for item in items if _trick_of(item[0]) not in off]
+    return dict(wanted if has(*wanted) else filter(has, wanted)) or None
