@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
@@ -83,56 +82,27 @@ def columns(residual: Callable, x: Scalars) -> tuple[Columns, list[Columns], Non
 
 
 def slopes(function: Callable, x: Scalars) -> tuple[Any, list[Any]]:
-    """function(*x) and its derivatives by x_k, one after the other, as `directional`
-    has them."""
+    """function(*x) and its derivatives by x_k, one after the other."""
     value, derivatives = None, []
     for k, at in enumerate(x):
-        value, slope = directional(
+        value, slope = jax.jvp(
             lambda t, k=k: function(*x[:k], t, *x[k + 1 :]), (at,), (jnp.ones_like(at),)
         )
         derivatives.append(slope)
     return value, derivatives
 
 
-def directional(function: Callable, at: tuple, direction: tuple) -> tuple[Any, Any]:
-    """function(*at) and its derivative along a direction, with None for what does not
-    depend on what moves: products with zeros a compiler has to keep."""
-    still: list[bool] = []
-    structure: list[Any] = []
-    watched = jax.custom_jvp(lambda *leaves: leaves)
-
-    def seen(leaves, tangents):
-        still[:] = [isinstance(t, SymbolicZero) for t in tangents]
-        return leaves, tangents
-
-    def flat(*x):
-        leaves, tree = jax.tree.flatten(function(*x))
-        structure.append(tree)
-        # what moves goes through as well, so that it is this derivative that is watched
-        # and none around it
-        return watched(*leaves, *jax.tree.leaves(x))[: len(leaves)]
-
-    watched.defjvp(seen, symbolic_zeros=True)
-    value, slope = jax.jvp(flat, at, direction)
-    # those that move come after
-    moving = [None if zero else s for zero, s in zip(still, slope, strict=False)]
-    return jax.tree.unflatten(structure[0], value), jax.tree.unflatten(
-        structure[0], moving
-    )
-
-
 def inner(a: PyTree, b: PyTree) -> Any:
-    """Sum of the products of the entries of two trees, numbers or arrays; None in the
-    second is zero."""
-    of = lambda x, y: (
-        None if y is None else x * y if jnp.ndim(x) == 0 else jnp.sum(x * y)
-    )
+    """Sum of the products of the entries of two trees, numbers or arrays; whole numbers
+    have no slopes and take no part."""
+
+    def of(x, y):
+        if y.dtype == jax.dtypes.float0:
+            return None
+        return x * y if jnp.ndim(x) == 0 else jnp.sum(x * y)
+
     products = jax.tree.leaves(jax.tree.map(of, a, b))
-    return (
-        sum(products[1:], products[0])
-        if products
-        else jnp.zeros((), jnp.result_type(*jax.tree.leaves(a)))
-    )
+    return sum(products[1:], products[0])
 
 
 def cholesky(n: Lower) -> tuple[Lower, Float[Array, "..."]]:

@@ -104,14 +104,7 @@ class Residuals(eqx.Module):
             (g, d), pull = jax.vjp(at, theta)
             if len(g) > 1:
                 r, push = jax.linearize(lambda theta: whiten(*at(theta), use), theta)
-                full = lambda entry, slope: (
-                    jnp.zeros_like(entry) if slope is None else slope
-                )
-                return (
-                    r,
-                    [push(jax.tree.map(full, theta, slope)) for slope in along],
-                    None,
-                )
+                return r, [push(slope) for slope in along], None
             weight = jnp.where(use, 1 / d[0][0], 0.0)
             (gradient,) = pull(([jnp.ones_like(weight)], [[-0.5 * g[0] * weight]]))
             return g, [[normal.inner(gradient, slope)] for slope in along], [weight]

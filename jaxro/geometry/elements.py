@@ -22,10 +22,10 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..adjustment.normal_equations import directional
 from ..adjustment.parameters import AbstractParameters, Step
 from . import rotations as rot
 from .rotations import Matrix, Vector
@@ -175,14 +175,14 @@ class RelativePose(AbstractElements):
 
             back = tuple(-entry for entry in columns[i])
             along.append(
-                directional(turned, (columns[i], columns[j]), (columns[j], back))[1]
+                jax.jvp(turned, (columns[i], columns[j]), (columns[j], back))[1]
             )
         first = self.bx, self.by, self.bz
         for tangent, t in zip(rot.tangents(first), x[3:], strict=True):
             direction = tuple(
                 q - t / 2 * p for p, q in zip(first, tangent, strict=True)
             )
-            value, slope = directional(
+            value, slope = jax.jvp(
                 lambda base: function(rotation, base), (base,), (direction,)
             )
             along.append(slope)

@@ -8,7 +8,7 @@ import optimistix as optx
 import pytest
 
 import jaxro
-from jaxro.adjustment import Term, normal_equations
+from jaxro.adjustment import Term
 
 # Levelling net of four unknown heights over one datum point (0): seven observed
 # differences [m], lengths [km].
@@ -185,29 +185,3 @@ def test_undetermined_parameter_is_reported():
     legs = jnp.asarray([0, 1, 0]), jnp.asarray([1, 2, 2]), jnp.asarray([1.0, 1.0, 2.1])
     result = jaxro.adjust(Term(levelling, legs, (None, None, 1.0)), jnp.zeros(3))
     assert result.result == jaxro.adjustment.RESULTS.rank_deficient
-
-
-def test_derivatives_along_a_direction_leave_out_what_stays():
-    """Also inside other derivatives, which see zeros of their own."""
-
-    def moved(x, y):
-        function = lambda a: {
-            "both": a * y,
-            "still": 3 * y,
-            "constant": jnp.ones(()),
-            "moves": a**2,
-        }
-        value, slope = normal_equations.directional(function, (x,), (jnp.ones_like(x),))
-        assert slope["still"] is None and slope["constant"] is None
-        weight = {"both": x, "still": y, "constant": y, "moves": jnp.ones(())}
-        return value["still"] + normal_equations.inner(weight, slope)  # 3 y + x y + 2 x
-
-    for wrt, expected in ((0, 2.0 + 5.0), (1, 3.0 + 4.0)):
-        forward, reverse = jax.jacfwd(moved, wrt), jax.grad(moved, wrt)
-        np.testing.assert_allclose(
-            [jax.jit(forward)(4.0, 5.0), reverse(4.0, 5.0)], expected
-        )
-    nothing = normal_equations.directional(
-        lambda a: (jnp.ones(()),), (jnp.ones(()),), (jnp.ones(()),)
-    )[1]
-    assert normal_equations.inner((jnp.ones(()),), nothing) == 0
