@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool
 
 from ...adjustment import normal_equations as normal
 from ...adjustment.residuals import Residuals
@@ -90,8 +90,7 @@ class FirstOrder(NamedTuple):
 def approach(pair: Pair, count: int) -> RelativePose:
     """The pose some Gauss-Newton steps from the vertical, which stays where they fail.
 
-    The first is by the first-order equations, a third of the work; the others are in
-    single precision, which far from the solution is as good.
+    The first is by the first-order equations, a third of the work.
     """
     pose = vertical(pair.focal_left)
     if count == 0:
@@ -100,22 +99,12 @@ def approach(pair: Pair, count: int) -> RelativePose:
     near = _take_step(pose, normal.steps(FirstOrder(pair), zero, 1, LONGEST))
     if count == 1:
         return near
-    single, points = _with_dtype(jnp.float32, near), _with_dtype(jnp.float32, pair)
-    zero = (jnp.zeros_like(points.focal_left),) * 5
-    return _take_step(
-        near, normal.steps(distances(points, single), zero, count - 1, LONGEST)
-    )
+    further = normal.steps(distances(pair, near), zero, count - 1, LONGEST)
+    return _take_step(near, further)
 
 
 def _take_step(pose: RelativePose, step: tuple[Array, ...]) -> RelativePose:
-    """The pose after a step of any precision, or unchanged where that is not finite."""
+    """The pose after a step, or unchanged where that is not finite."""
     fine = jnp.isfinite(sum(step))
-    there = pose.move(_with_dtype(pose.qw.dtype, step)).normalise()
+    there = pose.move(step).normalise()
     return jax.tree.map(lambda new, old: jnp.where(fine, new, old), there, pose)
-
-
-def _with_dtype(dtype, tree: PyTree) -> PyTree:
-    """The tree with its floating-point numbers in another precision."""
-    return jax.tree.map(
-        lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, tree
-    )

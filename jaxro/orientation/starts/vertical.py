@@ -9,7 +9,7 @@ from .base import AbstractStart, StartingPose, approach
 class Vertical(AbstractStart):
     """The normal case of aerial photography, and `steps` Gauss-Newton steps from it.
 
-    The first step is by first-order equations, the others are in single precision.
+    The first step is by first-order equations.
     Gauss-Newton reaches the solution from rotations of up to about 20°. With `steps`
     zero the elements begin at zero.
     """
