@@ -1,4 +1,5 @@
-"""What the suites share: sizes, poses and their comparison, the usual metrics."""
+"""Sizes of the suites, poses and their comparison, and the metrics that most suites
+have."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,11 +21,13 @@ Poses = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Size:
-    """How much is measured: pairs by number of points, the share of them the slower
-    peers get, repeats.
+    """How much is measured.
 
-    `robust`: what multiplies the numbers of pairs of the robust suites. `trials`: of
-    the comparison of procedures. `rows`: of large tables.
+    `pairs`: number of pairs by their number of points; slower programs get one of
+    `peer_share` pairs. `repeats`: of each measurement of time; `processes`: new
+    processes, and `calls` in each. `robust`: multiplies the numbers of pairs with wrong
+    points. `trials`: simulated pairs in the comparison of procedures. `rows`: of large
+    tables.
     """
 
     pairs: dict[int, int] = field(
@@ -101,12 +104,13 @@ def ratio(key: str, peer: float, ours: float, goal: float | None) -> Metric:
 
 
 def pose(orientation: jaxro.Orientation) -> jaxro.RelativePose:
-    """What the peers compute; the rest is then not computed by ours either."""
+    """The pose alone, as other programs compute it. The compiler leaves out the
+    rest."""
     return orientation.pose
 
 
 def listed(orientation: jaxro.Orientation) -> tuple:
-    """What makes an orientation whole: the pose, covariance, residuals, redundancy
-    numbers and model points."""
+    """The pose, covariance, residuals, redundancy numbers and model points: the results
+    that the goal of the whole orientation names."""
     o = orientation
     return o.pose, o.covariance, o.residuals, o.redundancy, o.model
