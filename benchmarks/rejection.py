@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import jaxro
 from jaxro.adjustment import critical_values
-from jaxro.experiments.compare import Setting, simulated
+from jaxro.experiments.compare import Setting, simulate
 from jaxro.geometry import coplanarity, mock_pairs
 from jaxro.orientation import starts
 from jaxro.rejection import PROCEDURES, Recommended, leave_one_out_grubbs as grubbs
@@ -34,11 +34,11 @@ def _oriented(pair: jaxro.Pair) -> jaxro.Orientation:
 
 
 def _exact(pair: jaxro.Pair):
-    return grubbs.refitted(pair, pair.mask, _oriented(pair).pose)[0]
+    return grubbs.refit_means(pair, pair.mask, _oriented(pair).pose)[0]
 
 
 def _closed(pair: jaxro.Pair):
-    return grubbs.closed_form(pair, pair.mask, _oriented(pair).pose)[0]
+    return grubbs.first_order_means(pair, pair.mask, _oriented(pair).pose)[0]
 
 
 def _pose_of(pair: jaxro.Pair):
@@ -312,7 +312,7 @@ def procedures(size: Size) -> list[Metric]:
     by ten sigma."""
     exact = mock_pairs.mock_pair(mock_pairs.row_layout())
     exact = jaxro.pair(*exact.coordinates, focal=exact.focal_left, sigma=SIGMA)
-    pairs, _ = simulated(exact, Setting("eight rows", 2, 10.0), size.trials, seed=0)
+    pairs, _ = simulate(exact, Setting("eight rows", 2, 10.0), size.trials, seed=0)
     compiling, times = 0.0, {}
     for name, procedure in PROCEDURES.items():
         clean = partial(

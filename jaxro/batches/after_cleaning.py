@@ -1,12 +1,13 @@
-"""What a cleaned pair is worth: how often its procedure keeps the right points, and
-holds the promised region.
+"""How good a procedure is on a pair it has cleaned, by simulation: how often it keeps
+just the right points, and how often the true pose lies in the region it promises.
 
-Simulated at the pose that was found. The points kept are moved onto the condition by
-their corrections and taken for the truth; in every repetition all coordinates get
-normal errors, and as many points as were rejected, drawn anew, get a wrong partner. The
-same procedure then judges, and its set and pose are held against the truth.
+The pose that was found is taken for the truth, and the points kept are moved onto its
+condition by their corrections. In every repetition all coordinates get normal errors,
+and as many points as were rejected, drawn anew, get a wrong partner. The same procedure
+then cleans the pair, and its points and pose are compared with the truth.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from ..adjustment import critical_values
 from ..adjustment.normal_equations import solve
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
+from ..geometry.mock_pairs import plant
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.results import is_usable
 from ..rejection import AbstractProcedure, Rejection
@@ -26,11 +28,11 @@ from .batch import map_batch
 
 
 class AfterCleaning(NamedTuple):
-    """Shares of the `repetitions`, all but the first of those that were `answered`:
-    cleaned, and usable.
+    """Shares of the `repetitions`, from 0 to 1.
 
-    `exactly_right`: the wrong points rejected and no other. `without_wrong`: no wrong
-    point kept. `coverage`: the true pose in the region promised at the `confidence`, a
+    `answered`: cleaned, with a usable orientation; all other shares are of those.
+    `exactly_right`: just the wrong points rejected. `without_wrong`: no wrong point
+    kept. `coverage`: the true pose in the region promised at the `confidence`, a
     posteriori; `coverage_known`: a priori, by the given sigma. `inflation`: root mean
     square of the pose's errors over the promised ones (1 where they are honest). A
     share p has the standard deviation sqrt(p (1 - p) / repetitions).
@@ -47,7 +49,7 @@ class AfterCleaning(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What is held against the truth of what a procedure found."""
+    """The results of a procedure that are compared with the truth."""
 
     pose: RelativePose
     usable: Bool[Array, "..."]
@@ -58,8 +60,8 @@ class Found(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """What one repetition tells; the errors squared, over the cofactors and over sigma0
-    = 1."""
+    """One repetition compared with the truth, with the fields of `AfterCleaning`;
+    `ratio`: the mean square of the pose's errors over the promised ones."""
 
     answered: Bool[Array, "..."]
     exactly_right: Bool[Array, "..."]
@@ -91,31 +93,29 @@ def after_cleaning(
     size.
     """
     pair, _ = mask_unusable(pair)
-    pairs, wrong = trials(
+    pairs, wrong = simulate(
         pair, rejection, key, repetitions, sigma0=sigma0, largest=largest
     )
-    found = map_batch(_Judged(procedure), pairs)
-    measured = judged(
-        pair, rejection.orientation.pose, wrong, found, sigma0, confidence
-    )
-    answered = count(measured.answered)
-    share = lambda held: count(held & measured.answered) / jnp.maximum(answered, 1.0)
-    ratio = jnp.sum(jnp.where(measured.answered, measured.ratio, 0.0)) / jnp.maximum(
-        answered, 1.0
-    )
+    found = map_batch(_Clean(procedure), pairs)
+    truth = rejection.orientation.pose
+    each = compare(pair, truth, wrong, found, sigma0, confidence)
+    answered = count(each.answered)
+    mean = lambda sum_: sum_ / jnp.maximum(answered, 1.0)
+    share = lambda held: mean(count(held & each.answered))
+    ratio = jnp.where(each.answered, each.ratio, 0.0)
     return AfterCleaning(
         answered=answered / repetitions,
-        exactly_right=share(measured.exactly_right),
-        without_wrong=share(measured.without_wrong),
-        coverage=share(measured.inside),
-        coverage_known=share(measured.inside_known),
-        inflation=jnp.sqrt(ratio),
+        exactly_right=share(each.exactly_right),
+        without_wrong=share(each.without_wrong),
+        coverage=share(each.inside),
+        coverage_known=share(each.inside_known),
+        inflation=jnp.sqrt(mean(jnp.sum(ratio))),
         confidence=confidence,
         repetitions=repetitions,
     )
 
 
-def trials(
+def simulate(
     pair: Pair,
     rejection: Rejection,
     key: PRNGKeyArray,
@@ -131,119 +131,150 @@ def trials(
     lies on the ray that a kept point of similar place suggests: the model point at the
     mean depth of those kept.
     """
-    pose, kept = rejection.orientation.pose, rejection.mask & pair.mask
-    ideal = errorless(pair, pose, kept)
-    number = jnp.sum(pair.mask & ~rejection.mask)
+    pose = rejection.orientation.pose
+    kept, rejected = pair.mask & rejection.mask, pair.mask & ~rejection.mask
     unit = jnp.asarray(1.0 if sigma0 is None else sigma0, pair.sigma.dtype)
+    most = largest
     if largest is None:
-        f = coplanarity.fundamental_matrix(
-            *pose.relative(), pair.focal_left, pair.focal_right
-        )
-        v = jax.vmap(lambda point, use: coplanarity.corrections(f, point, use))(
-            pair.coordinates, pair.mask & ~kept
-        )
-        size = jnp.max(jnp.stack([jnp.max(jnp.abs(c)) for c in v]))
-        most = jnp.maximum(
-            2 * size, 10 * jnp.max(jnp.where(pair.mask, pair.sigma, 0.0)) * unit
-        )
-    else:
-        most = jnp.asarray(largest, pair.sigma.dtype)
-
-    def one(key):
-        which, errors, moved = jax.random.split(key, 3)
-        rank = jnp.argsort(
-            jnp.argsort(
-                jnp.where(pair.mask, jax.random.uniform(which, pair.mask.shape), 2.0)
-            )
-        )
-        wrong = (rank < number) & pair.mask
-        noise = (unit * pair.sigma)[None, :] * jax.random.normal(
-            errors, (4, *pair.mask.shape)
-        )
-        size, sign = jax.random.split(moved)
-        planted = most * jax.random.uniform(
-            size, (2, *pair.mask.shape), minval=0.5, maxval=1.0
-        )
-        planted = planted * jax.random.rademacher(sign, planted.shape, planted.dtype)
-        planted = jnp.where(wrong[None, :], planted, 0.0)
-        shifts = (noise[0], noise[1], noise[2] + planted[0], noise[3] + planted[1])
-        new = [
-            jnp.where(pair.mask, c + s, 0.0) for c, s in zip(ideal, shifts, strict=True)
-        ]
-        return Pair(
-            *new, pair.sigma, pair.mask, pair.focal_left, pair.focal_right
-        ), wrong
-
-    return jax.vmap(one)(jax.random.split(key, repetitions))
+        most = _largest_error(pair, pose, rejected, unit)
+    x_left, y_left, x_right, y_right = (
+        jnp.where(pair.mask, c, 0.0) for c in errorless(pair, pose, kept)
+    )
+    exact = dataclasses.replace(
+        pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right
+    )
+    most = jnp.asarray(most, pair.sigma.dtype)
+    repeat = lambda key: _repeat(exact, jnp.sum(rejected), unit, most, key)
+    return jax.vmap(repeat)(jax.random.split(key, repetitions))
 
 
-def errorless(pair: Pair, pose: RelativePose, kept: Bool[Array, "point"]):
+def _repeat(
+    exact: Pair,
+    number: Int[Array, ""],
+    unit: Float[Array, ""],
+    most: Float[Array, ""],
+    key: PRNGKeyArray,
+) -> tuple[Pair, Bool[Array, "point"]]:
+    """A pair with normal errors and so many wrong points, and which they are."""
+    points = exact.mask.shape
+    which, noise, size = jax.random.split(key, 3)
+    chance = jnp.where(exact.mask, jax.random.uniform(which, points), 2.0)
+    rank = jnp.argsort(jnp.argsort(chance))
+    wrong = (rank < number) & exact.mask
+    sigma = (unit * exact.sigma)[None, :]
+    errors = sigma * jax.random.normal(noise, (4, *points))
+    partners = jnp.where(wrong[None, :], _wrong_partners(size, most, points), 0.0)
+    x_right, y_right = errors[2:] + partners
+    measured = plant(
+        exact, x_left=errors[0], y_left=errors[1], x_right=x_right, y_right=y_right
+    )
+    return measured, wrong
+
+
+def _wrong_partners(
+    key: PRNGKeyArray, most: Float[Array, ""], points: tuple[int, ...]
+) -> Float[Array, "2 point"]:
+    """Errors of both right coordinates, between the half and all of the largest, of any
+    sign."""
+    size, sign = jax.random.split(key)
+    shape = (2, *points)
+    errors = most * jax.random.uniform(size, shape, minval=0.5, maxval=1.0)
+    return errors * jax.random.rademacher(sign, shape, errors.dtype)
+
+
+def _largest_error(
+    pair: Pair,
+    pose: RelativePose,
+    rejected: Bool[Array, "point"],
+    unit: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Twice the largest correction of a rejected point, at least ten sigma."""
+    f = coplanarity.fundamental_matrix(
+        *pose.relative(), pair.focal_left, pair.focal_right
+    )
+    correct = lambda point, use: coplanarity.corrections(f, point, use)
+    corrections = jax.vmap(correct)(pair.coordinates, rejected)
+    size = jnp.max(jnp.abs(jnp.stack(corrections)))
+    sigma = jnp.max(jnp.where(pair.mask, pair.sigma, 0.0))
+    return jnp.maximum(2 * size, 10 * sigma * unit)
+
+
+def errorless(
+    pair: Pair, pose: RelativePose, kept: Bool[Array, "point"]
+) -> tuple[Float[Array, "point"], ...]:
     """Coordinates that satisfy the pose: of kept points the measured ones with their
     corrections, of others the left one and its partner at the mean depth of those
     kept."""
     rotation, base = pose.relative()
-    f = coplanarity.fundamental_matrix(
-        rotation, base, pair.focal_left, pair.focal_right
-    )
+    focal_left, focal_right = pair.focal_left, pair.focal_right
+    f = coplanarity.fundamental_matrix(rotation, base, focal_left, focal_right)
     back = rot.transpose(rotation)
+    nearness = _mean_nearness(pair, pose, kept)
 
-    def depth(point):
-        *_, w2, lam, _ = coplanarity.rays(
-            None, rotation, base, point, pair.focal_left, pair.focal_right
-        )
-        return jnp.where(w2 > 0, w2 / jnp.where(lam > 0, lam, jnp.inf), 0.0)
+    def partner(x, y):
+        level = rot.add_scaled((x, y, -focal_left), base, -nearness)
+        x, y, z = rot.apply(back, level)
+        z = jnp.where(z < 0, z, -focal_left)
+        return -focal_right * x / z, -focal_right * y / z
 
-    nearness = jax.vmap(depth)(pair.coordinates)
-    mean = jnp.sum(jnp.where(kept, nearness, 0.0)) / jnp.maximum(count(kept), 1.0)
-
-    def one(point, use):
+    def move(point, use):
         moved = point
         for _ in range(2):  # the correction is of first order
             v = coplanarity.corrections(f, moved, use)
             moved = tuple(c + e for c, e in zip(moved, v, strict=True))
-        ray = (point[0], point[1], -pair.focal_left)
-        level = rot.add_scaled(ray, base, -mean)
-        x, y, z = rot.apply(back, level)
-        z = jnp.where(z < 0, z, -pair.focal_left)
-        partner = (
-            point[0],
-            point[1],
-            -pair.focal_right * x / z,
-            -pair.focal_right * y / z,
+        x, y, *_ = point
+        other = (x, y, *partner(x, y))
+        return tuple(jnp.where(use, a, b) for a, b in zip(moved, other, strict=True))
+
+    return jax.vmap(move)(pair.coordinates, kept)
+
+
+def _mean_nearness(
+    pair: Pair, pose: RelativePose, kept: Bool[Array, "point"]
+) -> Float[Array, ""]:
+    """The mean of 1 / λ of the kept points, λ p1 the model point."""
+    rotation, base = pose.relative()
+
+    def nearness(point):
+        *_, square, depth, _ = coplanarity.rays(
+            None, rotation, base, point, pair.focal_left, pair.focal_right
         )
-        return tuple(jnp.where(use, a, b) for a, b in zip(moved, partner, strict=True))
+        in_front = jnp.where(depth > 0, depth, jnp.inf)
+        return jnp.where(square > 0, square / in_front, 0.0)
 
-    return jax.vmap(one)(pair.coordinates, kept)
+    each = jnp.where(kept, jax.vmap(nearness)(pair.coordinates), 0.0)
+    return jnp.sum(each) / jnp.maximum(count(kept), 1.0)
 
 
-def judged(
+def compare(
     pair: Pair,
     truth: RelativePose,
     wrong: Bool[Array, "repetition point"],
     found: Found,
-    known,
+    known: ArrayLike | None,
     confidence: float,
 ) -> Trial:
-    """`Trial` of all repetitions, from what the procedure found in each."""
-    pose, usable, mask, cofactor, sigma0, freedom = found
-    away = jax.vmap(lambda found: difference(found, truth))(pose)
-    squared = jax.vmap(_mahalanobis)(cofactor, away)
+    """`Trial` of all repetitions, from the results of the procedure in each; `known`:
+    sigma0 of the simulation."""
+    away = jax.vmap(lambda pose: difference(pose, truth))(found.pose)
+    squared = jax.vmap(_mahalanobis)(found.cofactor, away)
     unit = jnp.asarray(1.0 if known is None else known, squared.dtype)
+    freedom = found.degrees_of_freedom
+    fine = found.usable & (freedom > 0)
+    variance = jnp.where(fine, found.sigma0, 1.0) ** 2
     quantile = lambda f: critical_values.radius(confidence, 5, f) ** 2
     most = max(pair.mask.shape[0] - 5, 0)
-    limit = jax.vmap(lambda f: critical_values.by_count(quantile, most, f))(
-        freedom.astype(squared.dtype)
-    )
-    fine = usable & (freedom > 0)
-    checked = jnp.where(fine, sigma0, 1.0)
+    limit_of = lambda f: critical_values.by_count(quantile, most, f)
+    limit = jax.vmap(limit_of)(freedom.astype(squared.dtype))
+    limit_known = critical_values.chi_squared(1 - confidence, 5)
+    right_kept = found.mask ^ wrong
     return Trial(
         answered=fine,
-        exactly_right=jnp.all((mask ^ wrong) | ~pair.mask[None, :], axis=1),
-        without_wrong=~jnp.any(mask & wrong, axis=1),
-        inside=squared <= limit * checked**2,
-        inside_known=squared
-        <= critical_values.chi_squared(1 - confidence, 5) * unit**2,
-        ratio=squared / (5 * checked**2),
+        exactly_right=jnp.all(right_kept | ~pair.mask[None, :], axis=1),
+        without_wrong=~jnp.any(found.mask & wrong, axis=1),
+        inside=squared <= limit * variance,
+        inside_known=squared <= limit_known * unit**2,
+        ratio=squared / (5 * variance),
     )
 
 
@@ -254,41 +285,39 @@ def difference(pose: RelativePose, other: RelativePose) -> list[Array]:
     a, b, c, d = other.qw, other.qx, other.qy, other.qz
     real = w * a - x * b - y * c - z * d
     real = jnp.where(real == 0, jnp.finfo(real.dtype).tiny, real)
-    turn = (
+    imaginary = (
         w * b + x * a + y * d - z * c,
         w * c - x * d + y * a + z * b,
         w * d + x * c - y * b + z * a,
     )
+    turn = [2 * entry / real for entry in imaginary]
     base, there = (pose.bx, pose.by, pose.bz), (other.bx, other.by, other.bz)
-    shifts = [
-        jnp.where(rot.dot(base, there) > 0, rot.dot(t, there), jnp.inf)
-        for t in rot.tangents(base)
-    ]
-    return [*(2 * entry / real for entry in turn), *shifts]
+    same_side = rot.dot(base, there) > 0
+    shift = [rot.dot(tangent, there) for tangent in rot.tangents(base)]
+    return [*turn, *(jnp.where(same_side, s, jnp.inf) for s in shift)]
 
 
 def _mahalanobis(cofactor: Float[Array, "5 5"], away: list[Array]) -> Float[Array, ""]:
+    """xᵀ Q⁻¹ x"""
     lower = [[cofactor[i, j] for j in range(i + 1)] for i in range(len(away))]
-    return sum(
-        (a * b for a, b in zip(away, solve(lower, away), strict=True)),
-        jnp.zeros_like(away[0]),
-    )
+    products = [a * b for a, b in zip(away, solve(lower, away), strict=True)]
+    return sum(products[1:], products[0])
 
 
-class _Judged(eqx.Module):
-    """A procedure as a function of one pair that returns what is held against the
+class _Clean(eqx.Module):
+    """A procedure as a function of one pair with the results that are compared with the
     truth."""
 
     procedure: AbstractProcedure
 
     def __call__(self, pair: Pair) -> Found:
         rejection = self.procedure(pair)
-        o = rejection.orientation
+        orientation = rejection.orientation
         return Found(
-            o.pose,
-            is_usable(o.result),
-            rejection.mask,
-            o.cofactor,
-            o.sigma0,
-            o.degrees_of_freedom,
+            pose=orientation.pose,
+            usable=is_usable(orientation.result),
+            mask=rejection.mask,
+            cofactor=orientation.cofactor,
+            sigma0=orientation.sigma0,
+            degrees_of_freedom=orientation.degrees_of_freedom,
         )

@@ -85,12 +85,12 @@ NAMED = {
 
 @dataclass(frozen=True)
 class Counts:
-    """The rows of table 2: points and errors, and beside them the pairs.
+    """The rows of table 2: numbers of points, and of pairs.
 
-    `by_parallax`, `by_grubbs`: wrong points rejected by the first and the second stage;
-    `good`: good points rejected. Pairs left with exactly their good points:
-    `pairs_by_parallax` after the first stage, `pairs_by_grubbs` by the second;
-    `pairs_good`: that lost a good point.
+    `errors`: wrong points. `by_parallax`, `by_grubbs`: wrong points rejected by the
+    first and by the second stage; `good`: good points rejected; `missed`: wrong points
+    kept. `pairs_by_parallax`: pairs left with exactly their good points by the first
+    stage, `pairs_by_grubbs`: by the second; `pairs_good`: pairs that lost a good point.
     """
 
     points: int
@@ -105,7 +105,18 @@ class Counts:
     pairs_good: int
 
 
-PAPER = Counts(544, 44, 21, 20, 8, 3, 34, 9, 16, 8)
+PAPER = Counts(
+    points=544,
+    errors=44,
+    by_parallax=21,
+    by_grubbs=20,
+    good=8,
+    missed=3,
+    pairs=34,
+    pairs_by_parallax=9,
+    pairs_by_grubbs=16,
+    pairs_good=8,
+)
 
 
 @dataclass(frozen=True)
@@ -120,13 +131,12 @@ class Run:
 
 @dataclass(frozen=True)
 class Results:
-    """All runs; and of the pairs that the text describes, by layout (first key) and
-    name:
+    """All runs, and what the pairs that the text describes tell.
 
-    `named`: by tolerance the points rejected by parallax and by Grubbs, on the first
-    layout; `fitting`: (above, up to), the tolerances eps4 (mm) with which the first
-    stage rejects just the points that the text names. `conclusions`: the paper's six,
-    with the last tolerance.
+    `named`: by tolerance and pair the points rejected by parallax and by Grubbs, on the
+    first layout. `fitting`: by layout and pair (above, up to), the tolerances eps4 (mm)
+    with which the first stage rejects just the points that the text names.
+    `conclusions`: the paper's six, with the last tolerance.
     """
 
     runs: list[Run]
@@ -143,52 +153,84 @@ def run(
     """So many variants (the paper's 34, again and again) without and with noise,
     through both stages.
 
-    All pairs go as one batch, so that each stage is compiled once.
+    All pairs go as one batch, so that each stage is compiled once: the variants without
+    noise, the same with noise, the described pairs of every layout, and the pairs of
+    the conclusions.
     """
-    classes, errors = (np.resize(each, variants) for each in _pattern())
-    limits = np.array([CLASSES[name][:2] for name in classes])
-    key, planned = jax.random.key(seed), conclusions.plan()
-    drawn = jax.random.split(key, variants), jnp.asarray(errors), jnp.asarray(limits)
-    pairs, wrong = Program(_simulated, {}, COMPILE_FAST)(
-        (drawn, jnp.asarray(planned.errors), jax.random.fold_in(key, 1989))
-    )
-    wrong = np.asarray(wrong)
+    report = progress if progress is not None else lambda done, total: None
+    steps = len(TOLERANCES) + 1
+    planned = conclusions.plan()
+    pairs, classes, wrong = _pairs(variants, seed, planned)
     described = slice(2 * variants, 2 * variants + len(NAMED) * len(LAYOUTS))
-    rest = slice(described.stop, None)
     runs, named = [], {}
+    first = second = np.zeros(0)
     for done, eps4 in enumerate(TOLERANCES):
-        first, second = rejected(pairs, eps4)
+        first, second = reject(pairs, eps4)
         for noise in (False, True):
             part = slice(variants * noise, variants * (noise + 1))
-            count = lambda rows, part=part, first=first, second=second: counts(
-                wrong[rows], first[part][rows], second[part][rows]
-            )
-            by_class = {name: count(classes == name) for name in CLASSES}
-            runs.append(Run(eps4, noise, count(slice(None)), by_class))
-        numbers = [
-            [_numbers(row) for row in stage[described][: len(NAMED)]]
-            for stage in (first, second)
-        ]
-        named[eps4] = dict(zip(NAMED, zip(*numbers, strict=True), strict=True))
-        concluded = conclusions.conclude(
-            planned, first[rest], second[rest]
-        )  # the last tolerance stays
-        if progress is not None:
-            progress(done + 1, len(TOLERANCES) + 1)
-    excess = excesses(pairs)[described].reshape(len(LAYOUTS), len(NAMED), -1)
-    fitting = {
-        layout: {
-            name: _fitting(row, NAMED[name].rejected)
-            for name, row in zip(NAMED, rows, strict=True)
-        }
-        for layout, rows in zip(LAYOUTS, excess, strict=True)
-    }
-    if progress is not None:
-        progress(len(TOLERANCES) + 1, len(TOLERANCES) + 1)
+            one = _count_run(classes, wrong, first[part], second[part])
+            runs.append(Run(eps4, noise, *one))
+        named[eps4] = _name_points(first[described], second[described])
+        report(done + 1, steps)
+    rest = slice(described.stop, None)
+    concluded = conclusions.conclude(planned, first[rest], second[rest])
+    fitting = _fit_tolerances(excesses(pairs)[described])
+    report(steps, steps)
     return Results(runs, named, fitting, concluded)
 
 
-def rejected(pairs: Pair, eps4: float) -> tuple[np.ndarray, np.ndarray]:
+def _pairs(
+    variants: int, seed: int, planned: conclusions.Plan
+) -> tuple[Pair, np.ndarray, np.ndarray]:
+    """All pairs as a batch, and the class and the wrong points of each variant."""
+    classes, errors = (np.resize(each, variants) for each in _pattern())
+    limits = np.array([CLASSES[name][:2] for name in classes])
+    key = jax.random.key(seed)
+    keys = jax.random.split(key, variants)
+    drawn = keys, jnp.asarray(errors), jnp.asarray(limits)
+    noise_key = jax.random.fold_in(key, 1989)
+    plan = drawn, jnp.asarray(planned.errors), noise_key
+    pairs, wrong = Program(_simulate, {}, COMPILE_FAST)(plan)
+    return pairs, classes, np.asarray(wrong)
+
+
+def _count_run(
+    classes: np.ndarray, wrong: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> tuple[Counts, dict[str, Counts]]:
+    """The rows of table 2 of all pairs, and by class."""
+    by_class = {}
+    for name in CLASSES:
+        rows = classes == name
+        by_class[name] = counts(wrong[rows], first[rows], second[rows])
+    return counts(wrong, first, second), by_class
+
+
+def _name_points(
+    first: np.ndarray, second: np.ndarray
+) -> dict[str, tuple[list[int], list[int]]]:
+    """The numbers of the points rejected by each stage, of the described pairs on the
+    first layout."""
+    numbers = lambda mask: [int(i) + 1 for i in np.flatnonzero(mask)]
+    return {
+        name: (numbers(first[row]), numbers(second[row]))
+        for row, name in enumerate(NAMED)
+    }
+
+
+def _fit_tolerances(excess: np.ndarray) -> dict[str, dict[str, tuple[float, float]]]:
+    """The tolerances that reject the points described and no other, by layout and
+    pair."""
+    fitting = {}
+    by_layout = excess.reshape(len(LAYOUTS), len(NAMED), -1)
+    for layout, rows in zip(LAYOUTS, by_layout, strict=True):
+        fitting[layout] = {}
+        for (name, variant), row in zip(NAMED.items(), rows, strict=True):
+            out = np.isin(np.arange(len(row)) + 1, variant.rejected)
+            fitting[layout][name] = float(np.max(row[~out])), float(np.min(row[out]))
+    return fitting
+
+
+def reject(pairs: Pair, eps4: float) -> tuple[np.ndarray, np.ndarray]:
     """Points rejected by the first and by the second stage of `TwoStage`, (pair,
     point)."""
     kept, _ = clean_batch(pairs, _first(eps4), select=_decision)
@@ -203,16 +245,10 @@ def excesses(pairs: Pair) -> np.ndarray:
 
 
 def common(intervals: Iterable[tuple[float, float]]) -> tuple[float, float]:
-    """What intervals (above, up to) have in common; nothing where the first number is
-    not below the second."""
+    """The interval common to all intervals (above, up to); empty where the first number
+    is not below the second."""
     above, up_to = zip(*intervals, strict=True)
     return max(above), min(up_to)
-
-
-def _fitting(excess: np.ndarray, described: tuple[int, ...]) -> tuple[float, float]:
-    """The tolerances that reject the points described and no other."""
-    out = np.isin(np.arange(len(excess)) + 1, described)
-    return float(np.max(excess[~out])), float(np.min(excess[out]))
 
 
 def _first(eps4: float) -> AbstractProcedure:
@@ -220,74 +256,62 @@ def _first(eps4: float) -> AbstractProcedure:
     return eqx.tree_at(lambda p: p.eps4, TwoStage().first, jnp.asarray(eps4))
 
 
-def _numbers(mask: np.ndarray) -> list[int]:
-    return [int(i) + 1 for i in np.flatnonzero(mask)]
-
-
 def counts(wrong: np.ndarray, first: np.ndarray, second: np.ndarray) -> Counts:
-    """The rows of table 2 from what was planted and what each stage rejected, all
-    (pair, point)."""
+    """The rows of table 2 from the points planted wrong and those that each stage
+    rejected, all (pair, point)."""
+    number = lambda flags: int(np.sum(flags))
     out = first | second
-    perfect, at_once = np.all(out == wrong, axis=1), np.all(first == wrong, axis=1)
+    at_once = np.all(first == wrong, axis=1)
+    in_the_end = np.all(out == wrong, axis=1)
     return Counts(
-        wrong.size,
-        *(
-            int(np.sum(each))
-            for each in (
-                wrong,
-                first & wrong,
-                second & wrong,
-                out & ~wrong,
-                wrong & ~out,
-            )
-        ),
-        len(wrong),
-        *(
-            int(np.sum(each))
-            for each in (at_once, perfect & ~at_once, np.any(out & ~wrong, axis=1))
-        ),
+        points=wrong.size,
+        errors=number(wrong),
+        by_parallax=number(first & wrong),
+        by_grubbs=number(second & wrong),
+        good=number(out & ~wrong),
+        missed=number(wrong & ~out),
+        pairs=len(wrong),
+        pairs_by_parallax=number(at_once),
+        pairs_by_grubbs=number(in_the_end & ~at_once),
+        pairs_good=number(np.any(out & ~wrong, axis=1)),
     )
 
 
 def _pattern() -> tuple[np.ndarray, np.ndarray]:
     """The class and the number of errors of each of the 34 variants."""
-    rows = [
-        (name, i)
-        for name, c in CLASSES.items()
-        for i, pairs in enumerate(c.pairs, 1)
-        for _ in range(pairs)
-    ]
-    names, errors = zip(*rows, strict=True)
+    names, errors = [], []
+    for name, of_class in CLASSES.items():
+        for number, pairs in enumerate(of_class.pairs, 1):
+            names += [name] * pairs
+            errors += [number] * pairs
     return np.array(names), np.array(errors)
 
 
-def _simulated(plan: tuple):
-    """Pairs without noise, with noise, the described ones, those of the conclusions;
-    wrong points of the first."""
+def _simulate(plan: tuple):
+    """All pairs as a batch, and the wrong points of the variants."""
     drawn, errors, key = plan
     exact = mock_pairs.mock_pair(mock_pairs.row_layout())
+    points = exact.mask.shape
 
-    def one(key, errors, limits):
+    def vary(key, errors, limits):
         noise, place, size, sign = jax.random.split(key, 4)
-        wrong = (
-            jnp.argsort(jnp.argsort(jax.random.uniform(place, exact.mask.shape, float)))
-            < errors
-        )
-        sizes = (
-            jax.random.uniform(size, wrong.shape, float, limits[0], limits[1]) * SIGMA
-        )
-        signed = jnp.where(jax.random.bernoulli(sign, shape=wrong.shape), sizes, -sizes)
-        silent = plant(exact, y_right=jnp.where(wrong, signed, 0.0))
-        return silent, noisy(silent, noise, SIGMA), wrong
+        chance = jax.random.uniform(place, points, float)
+        wrong = jnp.argsort(jnp.argsort(chance)) < errors
+        least, most = limits
+        sizes = jax.random.uniform(size, points, float, least, most) * SIGMA
+        signed = jnp.where(jax.random.bernoulli(sign, shape=points), sizes, -sizes)
+        exact_but_wrong = plant(exact, y_right=jnp.where(wrong, signed, 0.0))
+        return exact_but_wrong, noisy(exact_but_wrong, noise, SIGMA), wrong
 
-    silent, measured, wrong = jax.vmap(one)(*drawn)
-    described = [_named(mock_pairs.mock_pair(layout)) for layout in LAYOUTS.values()]
-    parts = silent, measured, *described, conclusions.measured(exact, errors, key)
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *parts), wrong
+    without, measured, wrong = jax.vmap(vary)(*drawn)
+    described = [_describe(mock_pairs.mock_pair(layout)) for layout in LAYOUTS.values()]
+    concluded = conclusions.measure(exact, errors, key)
+    parts = without, measured, *described, concluded
+    return jax.tree.map(lambda *fields: jnp.concatenate(fields), *parts), wrong
 
 
-def _named(exact: Pair) -> Pair:
-    """The named variants as a batch."""
+def _describe(exact: Pair) -> Pair:
+    """The pairs that the text describes, as a batch."""
     errors = np.zeros((len(NAMED), exact.x_left.shape[0]))
     for row, variant in zip(errors, NAMED.values(), strict=True):
         row[[point - 1 for point in variant.errors]] = list(variant.errors.values())

@@ -32,7 +32,7 @@ MIDDLE = np.isin(ZONES, (1, 2))
 
 @dataclass(frozen=True)
 class Plan:
-    """What is planted: errors (pair, point) in mm; the other fields follow from it."""
+    """The planted errors, (pair, point) in mm, and what follows from them."""
 
     errors: np.ndarray
 
@@ -55,21 +55,17 @@ class Plan:
 def plan() -> Plan:
     """All pairs: single errors, two errors in a zone, none."""
     points = np.eye(len(ZONES))
-    single = [size * points[i] for size in SIZES for i in range(len(ZONES))]
-    same_zone = [
-        (i, j) for i, j in combinations(range(len(ZONES)), 2) if ZONES[i] == ZONES[j]
-    ]
+    single = [size * point for size in SIZES for point in points]
+    every_two = combinations(range(len(ZONES)), 2)
+    same_zone = [(i, j) for i, j in every_two if ZONES[i] == ZONES[j]]
     double = [
         SMALL * (points[i] + sign * points[j]) for i, j in same_zone for sign in (1, -1)
     ]
-    return Plan(
-        np.concatenate(
-            [np.repeat(single + double, DRAWS, axis=0), np.zeros((CLEAN, len(ZONES)))]
-        )
-    )
+    wrong = np.repeat(single + double, DRAWS, axis=0)
+    return Plan(np.concatenate([wrong, np.zeros((CLEAN, len(ZONES)))]))
 
 
-def measured(exact: Pair, errors, key) -> Pair:
+def measure(exact: Pair, errors, key) -> Pair:
     """The pairs of a plan with noise."""
     one = lambda row, key: plant(noisy(exact, key, SIGMA), y_right=row)
     return jax.vmap(one)(errors, jax.random.split(key, len(errors)))
@@ -134,7 +130,7 @@ def conclude(planned: Plan, first: np.ndarray, second: np.ndarray) -> Conclusion
     )
 
 
-def described(c: Conclusions) -> list[tuple[str, str, str]]:
+def describe(c: Conclusions) -> list[tuple[str, str, str]]:
     """(the paper's conclusion, what simulation gives, whether it holds) of the six."""
     percent = lambda value: f"{100 * value:.0f} %"
     sizes = lambda shares: ", ".join(

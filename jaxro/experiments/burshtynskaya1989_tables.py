@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from ..reports.text import table
 from .burshtynskaya1989 import NAMED, PAPER, TOLERANCES, Results, Run, common
-from .burshtynskaya1989_conclusions import described
+from .burshtynskaya1989_conclusions import describe
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -38,7 +38,7 @@ def tables(results: Results) -> "list[str | Table]":
         _by_class(results),
         "Pairs that the text describes: points rejected by residual parallax; by "
         "Grubbs",
-        _named(results),
+        _described_pairs(results),
         "Tolerances eps4 (mm) with which the first stage rejects just the points that "
         "the text names, by the rows of "
         "the layout (its figure is lost)",
@@ -99,7 +99,7 @@ def _by_class(results: Results) -> "Table":
     return rows
 
 
-def _named(results: Results) -> "Table":
+def _described_pairs(results: Results) -> "Table":
     rows = table(
         "variant",
         "errors [mm]",
@@ -137,7 +137,7 @@ def _conclusions(results: Results) -> "Table":
     rows = table("the paper", "simulated", "", left=3)
     for column in rows.columns:
         column.no_wrap = False
-    for cells in described(results.conclusions):
+    for cells in describe(results.conclusions):
         rows.add_row(*cells)
     return rows
 

@@ -2,6 +2,8 @@
 errors, by simulation."""
 
 import dataclasses
+import math
+from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -18,7 +20,9 @@ OCTAVES = (0.0, 2.0, -2.0, 5.0, -5.0, 12.0, -12.0)
 the share lies between two."""
 PRECISION = 1 / 256
 """Octaves: a quarter of a percent of the value."""
+
 LARGEST_LEVEL = 0.5
+
 USUAL = ("level", "limit")
 """Names of the field that decides, where a procedure has several numbers."""
 
@@ -35,71 +39,59 @@ class Calibration(NamedTuple):
 
 def adjustable(procedure: AbstractProcedure) -> str | None:
     """The field that says how readily the procedure rejects: one of the usual names, or
-    its only fraction."""
-    fields = dataclasses.fields(procedure)
-    names = [
-        field.name
-        for field in fields
-        if isinstance(getattr(procedure, field.name), float)
-    ]
-    return next(
-        (name for name in USUAL if name in names), names[0] if len(names) == 1 else None
-    )
+    its only number; None if it has several others."""
+    fields = [field.name for field in dataclasses.fields(procedure)]
+    names = [name for name in fields if isinstance(getattr(procedure, name), float)]
+    only = names[0] if len(names) == 1 else None
+    return next((name for name in USUAL if name in names), only)
 
 
-def calibrated(procedure: AbstractProcedure, clean: Pair, share: float) -> Calibration:
+def calibrate(procedure: AbstractProcedure, clean: Pair, share: float) -> Calibration:
     """The procedure that rejects something in this share of the pairs `clean`, which
     have no errors."""
     name = adjustable(procedure)
     if name is None:
-        return Calibration(
-            None, "", float("nan"), "not adjustable: no single level or tolerance"
-        )
+        reason = "not adjustable: no single level or tolerance"
+        return Calibration(None, "", math.nan, reason)
     own = getattr(procedure, name)
-    most = LARGEST_LEVEL if name == "level" else float("inf")
-    # the value goes in as an array, so that one compiled program serves all values
-    with_value = lambda value: eqx.tree_at(
-        lambda p: getattr(p, name), procedure, jnp.asarray(value)
-    )
-    value = lambda octaves: min(own * 2.0**octaves, most)
+    most = LARGEST_LEVEL if name == "level" else math.inf
+
+    def value(octaves: float) -> float:
+        return min(own * 2.0**octaves, most)
+
+    def with_value(value: float) -> AbstractProcedure:
+        # an array, so that one compiled program serves all values
+        field = lambda p: getattr(p, name)
+        return eqx.tree_at(field, procedure, jnp.asarray(value))
 
     def excess(octaves: float) -> float:
-        return (
-            float(
-                np.mean(
-                    np.asarray(
-                        clean_batch(clean, with_value(value(octaves)), select=_alarm)
-                    )
-                )
-            )
-            - share
-        )
+        alarms = clean_batch(clean, with_value(value(octaves)), select=_alarm)
+        return float(np.mean(np.asarray(alarms))) - share
 
     tried: dict[float, float] = {}
     for octaves in OCTAVES:
         tried[octaves] = excess(octaves)
-        crossing = [
-            (a, b)
-            for a, b in pairwise(sorted(tried))
-            if (tried[a] > 0) != (tried[b] > 0)
-        ]
-        if crossing:
-            break
-    else:
-        nearest = share + min(tried.values(), key=abs)
-        return Calibration(
-            None,
-            name,
-            float("nan"),
-            f"not adjustable: {name} reaches {nearest:.1%} at best",
-        )
-    low, high = crossing[0]
-    above = tried[low] > 0
+        for low, high in pairwise(sorted(tried)):
+            if (tried[low] > 0) != (tried[high] > 0):
+                found = value(_root(excess, low, high, tried[low] > 0))
+                return Calibration(with_value(found), name, found, "")
+    nearest = share + min(tried.values(), key=abs)
+    reason = f"not adjustable: {name} reaches {nearest:.1%} at best"
+    return Calibration(None, name, math.nan, reason)
+
+
+def _root(
+    excess: Callable[[float], float], low: float, high: float, above: bool
+) -> float:
+    """The octaves at which the excess changes its sign, by bisection down to PRECISION;
+    `above`: it is positive at the lower end."""
     while high - low > PRECISION:
         middle = (low + high) / 2
-        low, high = (middle, high) if (excess(middle) > 0) == above else (low, middle)
-    found = value((low + high) / 2)
-    return Calibration(with_value(found), name, found, "")
+        if (excess(middle) > 0) == above:
+            low = middle
+        else:
+            high = middle
+    return (low + high) / 2
 
 
 def _alarm(found: Rejection):

@@ -11,6 +11,7 @@ often without cause: each whose level or tolerance can be set is set so that it 
 given share of pairs without errors.
 """
 
+import itertools
 import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +31,7 @@ from ..orientation.results import is_usable
 from ..rejection import OUTCOMES, AbstractProcedure, Rejection
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
-from .calibration import Calibration, adjustable, calibrated
+from .calibration import Calibration, adjustable, calibrate
 
 LEAST = 6
 """Good points that a pair has at least."""
@@ -55,16 +56,16 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Score:
-    """What one procedure did in one setting; shares are of 1.
+    """The results of one procedure in one setting, as shares of 1.
 
-    `found`: wrong points named, the probability that a wrong point is rejected.
-    `misnamed`: pairs in which the first rejection takes a good point. `lost`: good
-    points rejected. `perfect`: pairs named exactly, that is, left with all of their
-    good points and no other. `alarms`: pairs that lost a good point; without errors,
-    the false alarms. `unfinished`: pairs with another outcome than finished. `angle`:
-    root mean square of the angle to the truth (arc minutes), of the rotation or the
-    base, whichever is larger, over the pairs with a usable orientation. `calibrated`:
-    at the common share of false alarms.
+    `calibrated`: whether the procedure is set to the common share of false alarms.
+    `found`: wrong points rejected, of all wrong points. `misnamed`: pairs in which the
+    first rejection takes a good point. `lost`: good points rejected. `perfect`: pairs
+    left with all of their good points and no other. `alarms`: pairs that lost a good
+    point; without errors, the false alarms. `unfinished`: pairs with another outcome
+    than finished. `angle`: root mean square of the angle to the truth (arc minutes), of
+    the rotation or the base, whichever is larger, over the pairs with a usable
+    orientation.
     """
 
     setting: Setting
@@ -108,128 +109,155 @@ def compare(
     that the calibrated procedures spoil; 0 leaves that comparison out. `progress(done,
     total)` counts runs of a procedure.
     """
+    settings = {
+        layout: _settings(layout, int(exact.count) - LEAST, errors, sizes)
+        for layout, exact in layouts.items()
+    }
     settable = [
         name
         for name, procedure in procedures.items()
         if false_alarms and adjustable(procedure)
     ]
-    kinds = [(n, s) for n in errors for s in (sizes if n else (0.0,))]
-    possible = {
-        name: [kind for kind in kinds if kind[0] <= int(exact.count) - LEAST]
-        for name, exact in layouts.items()
-    }
-    runs = sum(map(len, possible.values()))
-    total = len(layouts) * len(settable) + runs * (len(procedures) + len(settable))
-    done = 0
-
-    def step(count: int = 1) -> None:
-        nonlocal done
-        done += count
-        progress(done, total)
+    total = len(layouts) * len(settable)
+    total += sum(map(len, settings.values())) * (len(procedures) + len(settable))
+    numbers = itertools.count(1)
+    step = lambda: progress(next(numbers), total)
 
     scores: list[Score] = []
     calibrations: dict[str, dict[str, Calibration]] = {}
     for layout, exact in layouts.items():
-        truth = orient(exact).pose
-        known = calibrations.setdefault(layout, {})
+        known = calibrations[layout] = {}
         if false_alarms:
-            clean, _ = simulated(
+            clean, _ = simulate(
                 exact, Setting(layout, 0, 0.0), trials, seed, "calibration"
             )
             for name, procedure in procedures.items():
-                known[name] = calibrated(procedure, clean, false_alarms)
-                step(name in settable)
-        tuned = {
-            name: c.procedure for name, c in known.items() if c.procedure is not None
-        }
-        for kind in possible[layout]:
-            setting = Setting(layout, *kind)
-            pairs, wrong = simulated(exact, setting, trials, seed)
-            for name in procedures:
-                for procedure, own in (
-                    (procedures[name], False),
-                    (tuned.get(name), True),
-                ):
-                    if procedure is not None:
-                        scores.append(
-                            Score(
-                                setting,
-                                name,
-                                own,
-                                trials,
-                                *_judged(procedure, pairs, wrong, truth),
-                            )
-                        )
-                    step(not own or name in settable)
+                known[name] = calibrate(procedure, clean, false_alarms)
+                if name in settable:
+                    step()
+        versions = _versions(procedures, known, settable)
+        for setting in settings[layout]:
+            scores += _score_versions(exact, setting, trials, seed, versions, step)
     return Comparison(scores, false_alarms, calibrations)
 
 
-def simulated(
+def _settings(
+    layout: str, most: int, errors: Sequence[int], sizes: Sequence[float]
+) -> list[Setting]:
+    """The settings of a layout with at most so many wrong points; where none is wrong
+    there is no size."""
+    settings = []
+    for number in errors:
+        if number <= most:
+            kinds = sizes if number else (0.0,)
+            settings += [Setting(layout, number, size) for size in kinds]
+    return settings
+
+
+class Version(NamedTuple):
+    """A procedure as it is, or calibrated; None where that is not possible."""
+
+    name: str
+    calibrated: bool
+    procedure: AbstractProcedure | None
+
+
+def _versions(
+    procedures: Mapping[str, AbstractProcedure],
+    known: dict[str, Calibration],
+    settable: list[str],
+) -> list[Version]:
+    """Every procedure as it is, and those that can be set also calibrated."""
+    versions = []
+    for name, procedure in procedures.items():
+        versions.append(Version(name, False, procedure))
+        if name in settable:
+            versions.append(Version(name, True, known[name].procedure))
+    return versions
+
+
+def _score_versions(
+    exact: Pair,
+    setting: Setting,
+    trials: int,
+    seed: int,
+    versions: list[Version],
+    step: Callable[[], None],
+) -> list[Score]:
+    """The scores in one setting of the versions that there are."""
+    truth = orient(exact).pose
+    pairs, wrong = simulate(exact, setting, trials, seed)
+    scores = []
+    for name, calibrated, procedure in versions:
+        if procedure is not None:
+            found = _judge(procedure, pairs, wrong, truth)
+            scores.append(Score(setting, name, calibrated, trials, **found))
+        step()
+    return scores
+
+
+def simulate(
     exact: Pair, setting: Setting, trials: int, seed: int, use: str = ""
 ) -> tuple[Pair, np.ndarray]:
     """The trials of a setting and which points are wrong, (trial, point); the same
     whatever else is asked for."""
-    place = zlib.crc32(
-        f"{setting.layout} {setting.errors} {setting.size} {use}".encode()
-    )
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), place), trials)
-    pairs, wrong = Program(_simulated, {}, COMPILE_FAST)(
-        (exact, keys, jnp.asarray(setting.errors), jnp.asarray(setting.size))
-    )
+    name = f"{setting.layout} {setting.errors} {setting.size} {use}"
+    key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode()))
+    keys = jax.random.split(key, trials)
+    plan = exact, keys, jnp.asarray(setting.errors), jnp.asarray(setting.size)
+    pairs, wrong = Program(_simulate, {}, COMPILE_FAST)(plan)
     return pairs, np.asarray(wrong)
 
 
-def _simulated(plan: tuple):
+def _simulate(plan: tuple):
     exact, keys, errors, size = plan
+    points = exact.mask.shape
 
-    def one(key):
+    def measure(key):
         noise, place, sign = jax.random.split(key, 3)
-        chance = jnp.where(
-            exact.mask, jax.random.uniform(place, exact.mask.shape, float), 2.0
-        )
-        wrong = (jnp.argsort(jnp.argsort(chance)) < errors) & exact.mask
-        side = jnp.where(jax.random.bernoulli(sign, shape=wrong.shape), 1.0, -1.0)
+        chance = jax.random.uniform(place, points, float)
+        rank = jnp.argsort(jnp.argsort(jnp.where(exact.mask, chance, 2.0)))
+        wrong = (rank < errors) & exact.mask
+        side = jnp.where(jax.random.bernoulli(sign, shape=points), 1.0, -1.0)
         measured = noisy(exact, noise, exact.sigma[None, :])
-        return plant(
-            measured, y_right=jnp.where(wrong, side * size * exact.sigma, 0.0)
-        ), wrong
+        error = jnp.where(wrong, side * size * exact.sigma, 0.0)
+        return plant(measured, y_right=error), wrong
 
-    return jax.vmap(one)(keys)
+    return jax.vmap(measure)(keys)
 
 
-def _judged(
+def _judge(
     procedure: AbstractProcedure, pairs: Pair, wrong: np.ndarray, truth: RelativePose
-) -> tuple[Estimate, ...]:
-    """The estimates of a `Score`, in its order."""
-    kept, order, pose, usable, finished = clean_batch(pairs, procedure, select=_seen)
-    angle, usable = (
-        np.asarray(Program(_angles, {}, COMPILE_FAST)((truth, pose))),
-        np.asarray(usable),
-    )
-    out = np.asarray(pairs.mask & ~kept)
-    good = np.asarray(pairs.mask) & ~wrong
-    share = lambda part, whole: (
-        np.sum(part, axis=1)
-        / np.where(np.any(whole, axis=1), np.sum(whole, axis=1), np.nan)
-    )
-    return (
-        estimate(share(out & wrong, wrong)),
-        estimate(np.any((np.asarray(order) == 1) & good, axis=1)),
-        estimate(share(out & good, good)),
-        estimate(np.all(out == wrong, axis=1)),
-        estimate(np.any(out & good, axis=1)),
-        estimate(~np.asarray(finished)),
-        root_mean_square(angle[usable]),
-    )
+) -> dict[str, Estimate]:
+    """The estimates of a `Score`."""
+    kept, order, pose, usable, finished = clean_batch(pairs, procedure, select=_select)
+    angle = np.asarray(Program(_angles, {}, COMPILE_FAST)((truth, pose)))
+    mask = np.asarray(pairs.mask)
+    out, good = mask & ~np.asarray(kept), mask & ~wrong
+    first = np.asarray(order) == 1
+
+    def share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+        number = np.sum(whole, axis=1)
+        return np.sum(part, axis=1) / np.where(number > 0, number, np.nan)
+
+    return {
+        "found": estimate(share(out & wrong, wrong)),
+        "misnamed": estimate(np.any(first & good, axis=1)),
+        "lost": estimate(share(out & good, good)),
+        "perfect": estimate(np.all(out == wrong, axis=1)),
+        "alarms": estimate(np.any(out & good, axis=1)),
+        "unfinished": estimate(~np.asarray(finished)),
+        "angle": root_mean_square(angle[np.asarray(usable)]),
+    }
 
 
-def _seen(found: Rejection):
-    o = found.orientation
+def _select(found: Rejection):
+    orientation = found.orientation
     return (
         found.mask,
         found.order,
-        o.pose,
-        is_usable(o.result),
+        orientation.pose,
+        is_usable(orientation.result),
         found.outcome == OUTCOMES.finished,
     )
 
@@ -238,34 +266,30 @@ def _angles(truth_and_poses: tuple[RelativePose, RelativePose]):
     """The larger of the angles between the rotations and between the bases, arc
     minutes: 2 asin(chord / 2)."""
     truth, poses = truth_and_poses
-    rotation, base = truth.relative()
 
-    def one(pose):
-        other, direction = pose.relative()
-        turn = sum(
-            (a - b) ** 2
-            for p, q in zip(rotation, other, strict=True)
-            for a, b in zip(p, q, strict=True)
-        )
-        chord = sum((a - b) ** 2 for a, b in zip(base, direction, strict=True))
+    def squared_distance(one, other):
+        pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+        return sum((a - b) ** 2 for a, b in pairs)
+
+    def angle(pose):
+        turn, chord = map(squared_distance, truth.relative(), pose.relative())
         # two rotations by an angle apart differ by sqrt(8) sin(angle / 2) in the
         # Frobenius norm
         half = jnp.sqrt(jnp.maximum(turn / 8, chord / 4))
         return jnp.rad2deg(2 * jnp.arcsin(jnp.minimum(half, 1.0))) * 60
 
-    return jax.vmap(one)(poses)
+    return jax.vmap(angle)(poses)
 
 
 def estimate(values: np.ndarray) -> Estimate:
     """Mean and standard error of the trials in which the value exists."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
-    mean = float(np.mean(values)) if values.size else math.nan
-    error = (
-        float(np.std(values, ddof=1) / math.sqrt(values.size))
-        if values.size > 1
-        else math.nan
-    )
+    mean = error = math.nan
+    if values.size:
+        mean = float(np.mean(values))
+    if values.size > 1:
+        error = float(np.std(values, ddof=1) / math.sqrt(values.size))
     return Estimate(mean, error)
 
 

@@ -26,29 +26,29 @@ def tables(comparison: Comparison) -> "Iterator[str | Table]":
             f"{layout}, {here[0].trials} pairs a row; % of points or pairs ± standard "
             "error; angle to the truth, rms"
         )
-        yield from _both([s for s in here if not s.calibrated])
+        yield from _tables([s for s in here if not s.calibrated])
         if comparison.false_alarms:
             share = f"{100 * comparison.false_alarms:g} %"
             yield (
                 f"{layout}, every procedure set so that {share} of the pairs without "
                 "errors lose a point"
             )
-            yield _set(comparison.calibrations[layout])
-            yield from _both([s for s in here if s.calibrated])
+            yield _setting_table(comparison.calibrations[layout])
+            yield from _tables([s for s in here if s.calibrated])
 
 
-def _both(scores: list[Score]) -> "Iterator[Table]":
+def _tables(scores: list[Score]) -> "Iterator[Table]":
     clean, spoiled = (
         [s for s in scores if bool(s.setting.errors) == wrong]
         for wrong in (False, True)
     )
     if clean:
-        yield _clean(clean)
+        yield _clean_table(clean)
     if spoiled:
-        yield _spoiled(spoiled)
+        yield _error_table(spoiled)
 
 
-def _clean(scores: list[Score]) -> "Table":
+def _clean_table(scores: list[Score]) -> "Table":
     rows = table("no errors", "false alarms", "good lost", "undone", "angle [']")
     for s in scores:
         rows.add_row(
@@ -57,7 +57,7 @@ def _clean(scores: list[Score]) -> "Table":
     return rows
 
 
-def _spoiled(scores: list[Score]) -> "Table":
+def _error_table(scores: list[Score]) -> "Table":
     rows = table(
         "errors",
         "procedure",
@@ -81,7 +81,7 @@ def _spoiled(scores: list[Score]) -> "Table":
     return rows
 
 
-def _set(calibrations: dict[str, Calibration]) -> "Table":
+def _setting_table(calibrations: dict[str, Calibration]) -> "Table":
     rows = table("procedure", "set to", left=2)
     for name, c in calibrations.items():
         rows.add_row(name, c.reason or f"{c.name} = {c.value:.3g}")

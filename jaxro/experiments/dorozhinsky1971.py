@@ -21,8 +21,15 @@ from ..batches.batch import clean_batch
 from ..geometry import mock_pairs
 from ..geometry.elements import IndependentElements
 from ..geometry.pairs import Pair, pad, stack
-from ..rejection import OUTCOMES, Dorozhinsky, base
-from ..rejection.leave_one_out_grubbs import linearised
+from ..rejection import OUTCOMES, Dorozhinsky, Rejection
+from ..rejection.leave_one_out_grubbs import influence
+from ..rejection.parallaxes import (
+    adjust_parallaxes,
+    iterate_once,
+    parallaxes,
+    zero_elements,
+)
+from ..rejection.rounds import element_values
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .dorozhinsky1971_first_order import EQUATIONS, by_the_papers_rule
@@ -88,10 +95,15 @@ EXAMPLE = (0.01,) * 9 + (0.10,)
 """mm; the paper rounds m_q to .045 and 3 m_q to .13."""
 
 
+ROW_OF_TABLE_2, ROW_OF_TEN, FIRST_NOISY = (len(TABLE_1) + k for k in range(3))
+"""Rows of the batch: first table 1, then the pair of table 2, the ten points of the
+introduction, and the noisy pairs."""
+
+
 @dataclass(frozen=True)
 class Decision:
-    """What the proposed algorithm did: numbers of the points rejected, in order; mean
-    |q| of those kept (mm)."""
+    """A decision of the proposed algorithm: numbers of the points rejected, in order;
+    mean |q| of those kept (mm); outcome."""
 
     rejected: list[int]
     left: float
@@ -139,38 +151,39 @@ class Results:
 
 def run() -> Results:
     """Calculate all of it; the noisy pairs have a fixed seed."""
-    pairs, strict, (parallax, elements), influence = Program(
-        _calculated, {}, COMPILE_FAST
-    )(jnp.asarray(ERRORS))
+    calculated = Program(_calculate, {}, COMPILE_FAST)(jnp.asarray(ERRORS))
+    pairs, strict, (parallax, elements), influences = calculated
     q, m_q = map(np.asarray, strict)
     decisions = {
         corrections: _decisions(pairs, corrections) for corrections in READINGS
     }
-    by_row = lambda row: {
-        corrections: found[row] for corrections, found in decisions.items()
-    }
+
+    def by_reading(row: int) -> dict[int, Decision]:
+        return {corrections: found[row] for corrections, found in decisions.items()}
+
     columns = [
-        Column(n, q[row, :n], float(m_q[row]), by_row(row))
+        Column(
+            points=n,
+            parallax=q[row, :n],
+            m_q=float(m_q[row]),
+            decisions=by_reading(row),
+        )
         for row, n in enumerate(TABLE_1)
     ]
-    second, ten, noisy = len(TABLE_1), len(TABLE_1) + 1, len(TABLE_1) + 2
-    exactly = {
-        corrections: float(
-            np.mean([set(one.rejected) == {7, 8} for one in found[noisy:]])
-        )
-        for corrections, found in decisions.items()
-    }
     in_minutes = np.rad2deg(np.asarray(elements)) * 60
-    ten_q = q[ten, : len(TEN_ZONES)]
+    ten_q = q[ROW_OF_TEN, : len(TEN_ZONES)]
     too_large = np.abs(ten_q) - np.mean(np.abs(ten_q)) >= TEN_TOLERANCE
     return Results(
         columns=columns,
         parallax=np.asarray(parallax),
         elements=in_minutes[:, list(IN_THE_ORDER_OF_THE_PAPER)],
-        pair_of_table_2=by_row(second),
-        named_exactly=exactly,
+        pair_of_table_2=by_reading(ROW_OF_TABLE_2),
+        named_exactly={
+            corrections: _named_exactly(found[FIRST_NOISY:])
+            for corrections, found in decisions.items()
+        },
         least_squares={
-            equation: 36 * np.asarray(influence[equation]) for equation in EQUATIONS
+            equation: 36 * np.asarray(influences[equation]) for equation in EQUATIONS
         },
         own_rule={equation: by_the_papers_rule(equation) for equation in EQUATIONS},
         ten=ten_q,
@@ -179,29 +192,20 @@ def run() -> Results:
     )
 
 
-def _calculated(errors):
+def _calculate(errors: Float[Array, "point"]):
     """All pairs as a batch, their strict solutions, the iterations of table 2, and the
-    influences.
-
-    The batch: table 1, the pair of table 2, the ten points of the introduction, the
-    noisy pairs.
-    """
-    most = table_1(errors)
-    masks = jnp.arange(max(TABLE_1))[None, :] < jnp.array(list(TABLE_1))[:, None]
-    first = jax.vmap(most.with_mask)(masks)
-    two = pad(table_1(errors[:8]), max(TABLE_1))
+    influences by equation."""
+    most = max(TABLE_1)
+    masks = jnp.arange(most)[None, :] < jnp.array(list(TABLE_1))[:, None]
+    first = jax.vmap(table_1(errors).with_mask)(masks)
+    eight = pad(table_1(errors[:8]), most)
     keys = jax.random.split(jax.random.key(1971), NOISY)
-    noisy = jax.vmap(lambda key: mock_pairs.noisy(two, key, NOISE))(keys)
-    single = [pad(one, max(TABLE_1)) for one in (table_2(), ten_points())]
-    pairs = jax.tree.map(
-        lambda *parts: jnp.concatenate(parts), first, stack(single), noisy
-    )
-    return (
-        pairs,
-        jax.vmap(_strict)(pairs),
-        _iterations(table_2()),
-        {equation: _influence(equation) for equation in EQUATIONS},
-    )
+    noisy = jax.vmap(lambda key: mock_pairs.noisy(eight, key, NOISE))(keys)
+    single = stack([pad(table_2(), most), pad(ten_points(), most)])
+    parts = first, single, noisy
+    pairs = jax.tree.map(lambda *fields: jnp.concatenate(fields), *parts)
+    influences = {equation: _influence(equation) for equation in EQUATIONS}
+    return pairs, jax.vmap(_strict)(pairs), _iterations(table_2()), influences
 
 
 def ten_points() -> Pair:
@@ -230,47 +234,58 @@ def table_2() -> Pair:
 
 
 def _decisions(pairs: Pair, corrections: int) -> list[Decision]:
-    found = clean_batch(pairs, Dorozhinsky(corrections=corrections), select=_decided)
+    """The decisions of the proposed algorithm on each pair."""
+    found = clean_batch(pairs, Dorozhinsky(corrections=corrections), select=_select)
     order, q, kept, outcome = map(np.asarray, found)
     names = {int(item._value): name for name, item in OUTCOMES._name_to_item.items()}
     decisions = []
-    for row in range(len(order)):
-        rejected = sorted(
-            np.flatnonzero(order[row]), key=lambda i, row=row: order[row, i]
-        )
-        mean = float(np.sum(np.abs(q[row][kept[row]])) / np.sum(kept[row]))
+    for row, numbers in enumerate(order):
+        rejected = sorted(np.flatnonzero(numbers), key=lambda i, n=numbers: n[i])
+        left = np.sum(np.abs(q[row][kept[row]])) / np.sum(kept[row])
         decisions.append(
-            Decision([int(i) + 1 for i in rejected], mean, names[int(outcome[row])])
+            Decision(
+                rejected=[int(i) + 1 for i in rejected],
+                left=float(left),
+                outcome=names[int(outcome[row])],
+            )
         )
     return decisions
 
 
+def _select(found: Rejection):
+    return found.order, found.orientation.parallax, found.mask, found.outcome._value
+
+
+def _named_exactly(decisions: list[Decision]) -> float:
+    """The share of pairs from which exactly points 7 and 8 were rejected."""
+    return float(np.mean([set(one.rejected) == {7, 8} for one in decisions]))
+
+
 def _strict(pair: Pair):
-    solved = base.by_parallax(pair, pair.mask)
+    """Residual parallaxes and m_q of the converged solution of all points."""
+    solved = adjust_parallaxes(pair, pair.mask)
     return solved.parallax, solved.m_q
-
-
-def _decided(r):
-    return r.order, r.orientation.parallax, r.mask, r.outcome._value
 
 
 def _iterations(pair: Pair):
     """Five iterations from zero: parallaxes before each, elements after it."""
 
-    def iteration(elements, _):
-        new = base.iterated(pair, pair.mask, elements)
-        return new, (base.parallaxes(pair, pair.mask, elements), base.values(new))
+    def iterate(elements, _):
+        new = iterate_once(pair, pair.mask, elements)
+        before = parallaxes(pair, pair.mask, elements)
+        return new, (before, element_values(new))
 
-    return lax.scan(iteration, base.zero_elements(pair), None, len(TABLE_2))[1]
+    return lax.scan(iterate, zero_elements(pair), None, len(TABLE_2))[1]
 
 
 def _influence(equation: int):
-    """What an error of point 7 leaves, (1 - H) of its column, H = A (AᵀA)⁻¹ Aᵀ: a law
-    of the layout."""
+    """The residuals that an error of point 7 leaves, the column (1 - H) of this point,
+    H = A (AᵀA)⁻¹ Aᵀ: a law of the layout."""
     zones, _ = EQUATIONS[equation]
     x, y = zip(*(mock_pairs.ZONES[zone] for zone in zones), strict=True)
     flat = mock_pairs.mock_pair(mock_pairs.Layout(x, y, zones))
-    _, (a, z), _ = linearised(flat, flat.mask, base.zero_elements(flat))
-    return jnp.eye(len(zones))[6] - sum(
-        column * solved[6] for column, solved in zip(a, z, strict=True)
-    )
+    found = influence(flat, flat.mask, zero_elements(flat))
+    column = jnp.eye(len(zones))[6]
+    for a, z in zip(found.columns, found.solved, strict=True):
+        column = column - a * z[6]
+    return column

@@ -21,6 +21,7 @@ own rule, and that of least squares.
 """
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
@@ -42,47 +43,52 @@ MISPRINTS = {
     10: "the sign of v5 is a misprint; -delta b7 in v6 stands for -delta q7",
 }
 
-SIDES = (((1, 3, 5), 0), ((2, 4, 6), 1))
-"""Zones of the left and of the right side (principal point, above, below), and x in
-units of the base."""
+SIDES = (1, 3, 5), (2, 4, 6)
+"""Zones of the left and of the right side: principal point, above, below."""
 
 
 def coefficients(zones: Sequence[int], f: float, b: float, y: float) -> np.ndarray:
     """d v / d (alpha, chi, omega', alpha', chi') of points in these zones, (point,
     5)."""
-    rows = []
-    for x, side in (ZONES[zone] for zone in zones):
-        x, y_here = b * x, y * side
-        rows.append(
-            (x * y_here / f, x, -(f + y_here**2 / f), (b - x) * y_here / f, b - x)
-        )
-    return np.array(rows)
+    places = np.array([ZONES[zone] for zone in zones])
+    x = b * places[:, 0]
+    height = y * places[:, 1]
+    right = b - x
+    omega = -(f + height**2 / f)
+    return np.stack([x * height / f, x, omega, right * height / f, right], axis=1)
 
 
-def averaged(
+def average(
     zones: Sequence[int], q: np.ndarray, f: float = 1.0, b: float = 1.0, y: float = 1.0
 ) -> np.ndarray:
     """alpha, chi, omega', alpha', chi' by the paper's means: equations (6), (8), (6')
     and (7')."""
-    of = {
+    by_zone = {
         zone: [v for z, v in zip(zones, q, strict=True) if z == zone] for zone in ZONES
     }
     tilts, omegas = [], []
-    for (middle, above, below), _ in SIDES:
-        pairs = [(a, c) for a in of[above] for c in of[below]]
-        tilts.append(np.mean([f / (2 * b * y) * (c - a) for a, c in pairs]))
-        omegas += [f / (2 * y**2) * (c + a - 2 * of[middle][0]) for a, c in pairs]
-    omega = np.mean(omegas)
-    swings = []
-    for (middle, above, below), _ in SIDES:
-        own = f / b * omega - of[middle][0] / b
-        # alpha drops out of the sum over the zones above and below
-        by_zone = [np.mean(of[zone]) for zone in (middle, above, below)]
-        mean = (f / b + 2 * y**2 / (3 * f * b)) * omega - np.mean(by_zone) / b
-        more = any(len(of[zone]) > 1 for zone in (middle, above, below))
-        swings.append(mean if more else own)
+    for middle, above, below in SIDES:
+        centre = by_zone[middle][0]
+        pairs = np.array(list(product(by_zone[above], by_zone[below])))
+        up, low = pairs[:, 0], pairs[:, 1]
+        tilts.append(np.mean(f / (2 * b * y) * (low - up)))
+        omegas += list(f / (2 * y**2) * (low + up - 2 * centre))
+    omega = float(np.mean(omegas))
+    swings = [
+        _swing([by_zone[zone] for zone in side], omega, f, b, y) for side in SIDES
+    ]
     (alpha_right, alpha), (chi_right, chi) = tilts, swings
     return np.array([alpha, chi, omega, alpha_right, chi_right])
+
+
+def _swing(side: list, omega: float, f: float, b: float, y: float) -> float:
+    """chi or chi' from the parallaxes of the principal point and the zones above and
+    below it."""
+    if all(len(zone) == 1 for zone in side):
+        return f / b * omega - side[0][0] / b
+    # alpha drops out of the sum over the zones above and below
+    mean = float(np.mean([np.mean(zone) for zone in side]))
+    return (f / b + 2 * y**2 / (3 * f * b)) * omega - mean / b
 
 
 def by_the_papers_rule(equation: int, wrong: int = 6) -> np.ndarray:
@@ -90,4 +96,5 @@ def by_the_papers_rule(equation: int, wrong: int = 6) -> np.ndarray:
     in 36ths of it; f = b = y."""
     zones, _ = EQUATIONS[equation]
     q = np.eye(len(zones))[wrong]
-    return 36 * (coefficients(zones, 1.0, 1.0, 1.0) @ averaged(zones, q) + q)
+    elements = average(zones, q)
+    return 36 * (coefficients(zones, 1.0, 1.0, 1.0) @ elements + q)

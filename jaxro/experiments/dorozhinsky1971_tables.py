@@ -19,7 +19,7 @@ from .dorozhinsky1971 import (
     Decision,
     Results,
 )
-from .dorozhinsky1971_first_order import EQUATIONS, MISPRINTS, averaged
+from .dorozhinsky1971_first_order import EQUATIONS, MISPRINTS, average
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -129,7 +129,7 @@ def _by_iteration(found: np.ndarray, printed: tuple, heads: list[str]) -> "Table
 
 def _elements_of_7() -> "Table":
     zones, _ = EQUATIONS[9]
-    found = averaged(zones, np.eye(len(zones))[6])
+    found = average(zones, np.eye(len(zones))[6])
     rows = table("", "alpha", "chi", "omega'", "alpha'", "chi'")
     rows.add_row("own rule", *(number(v, 4) for v in found))
     rows.add_row("paper", "-1/4", "1/9", "1/6", "0", "1/6")
@@ -173,17 +173,17 @@ def _algorithm(results: Results) -> "Table":
     ):
         rows.add_row(
             name,
-            _listed(wrong),
+            _numbers(wrong),
             *(cell for n in READINGS for cell in _cells(decisions[n])),
         )
     return rows
 
 
 def _cells(decision: Decision) -> tuple[str, str]:
-    return _listed(
+    return _numbers(
         decision.rejected
     ), f"{decision.outcome}, mean |q| {number(decision.left, 3)} mm"
 
 
-def _listed(points: list[int]) -> str:
+def _numbers(points: list[int]) -> str:
     return " ".join(map(str, points)) or "-"

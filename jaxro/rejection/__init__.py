@@ -1,7 +1,23 @@
 """Procedures that find wrong points, one file each.
 
 Each is an object with its tolerances as fields: `procedure(pair) -> Rejection`, under
-jit and vmap as well. PROCEDURES is the one list of them.
+jit and vmap as well. PROCEDURES is the one list of them: the command line, the tests
+and the README's table read it. A new procedure is a new file with a subclass of
+`AbstractProcedure`, and a line in PROCEDURES.
+
+What procedures share, from the bottom up:
+
+* base, rounds: the result, and the log of the rounds that lead to it
+* masked, subsets: sums over the points in use, random subsets of them
+* parallaxes: the adjustment of the papers of 1971 and 1989
+* steps, agreement, visibility: Gauss-Newton steps of a pose, and the points that agree
+  with it
+* verdict: the result of a procedure that finds the pose first
+* hypotheses: orientations of random subsets, for `Ransac` and `LeastMedian`
+* search, five_points, neighbours: the search for photos in any position
+* evidence, noise, fading: whether points agree by chance, the noise of their residuals,
+  and their weights where this is not normal
+* stages, quick, thorough: the stages of `Recommended`
 """
 
 from ..adjustment import losses
@@ -18,7 +34,7 @@ from .graduated_non_convexity import GraduatedNonConvexity as GraduatedNonConvex
 from .least_median import LeastMedian as LeastMedian
 from .leave_one_out_grubbs import (
     LeaveOneOutGrubbs as LeaveOneOutGrubbs,
-    calibrated as calibrated,
+    calibrate as calibrate,
 )
 from .mean_parallax import MeanParallax as MeanParallax
 from .noise import Noise as Noise, noise_of as noise_of, pooled as pooled

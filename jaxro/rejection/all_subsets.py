@@ -10,41 +10,39 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment import critical_values
-from ..adjustment.normal_equations import SINGULAR, accumulate, cholesky, substitute
+from ..adjustment.normal_equations import SINGULAR, cholesky, substitute
+from ..geometry.elements import RelativePose
 from ..geometry.linear import Linear, linearised
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import orient
 from ..orientation.starts import AbstractStart, Vertical
-from ..xla.passes import count, total
-from .base import (
-    OUTCOMES,
-    AbstractProcedure,
-    Rejection,
-    Round,
-    began,
-    ended,
-    finished,
-    independent,
-    recorded,
-)
-from .robust import improved, normalised, scaled
+from ..xla.passes import count
+from .agreement import normalised_residuals, state_sigma
+from .base import OUTCOMES, AbstractProcedure, Rejection
+from .masked import Use, sum_of
+from .rounds import Round, conclude_round, finished_outcome, independent_values
+from .steps import improve, inner, normal_equations
 
 CHOICES = 1 << 18
 """Choices that are compared at most: their numbers take some 10 MB."""
+
+Choices = Bool[Array, "number choice point"]
+"""Points omitted, by number of omissions and choice."""
 
 
 class AllSubsets(AbstractProcedure):
     """Of all choices of at most `most` omissions the fewest that pass the global test,
     and of these the best.
 
-    What a choice S leaves of Σ r² (r of sigma 1) is first computed from the solution of
-    all points, to first order: Ω - r_S' (I - H_SS)⁻¹ r_S, H = A N⁻¹ A' (Cook and
-    Weisberg 1982). The best `shortlist` of every number of omissions are then solved by
-    `iterations` Gauss-Newton steps. A choice passes if Σ r² is at most the chi-squared
-    value of `level` for its n - 5 degrees of freedom. At least `least` points stay. No
-    choice passes: `no_choice`, and nothing is rejected. There are 2,516 choices of at
-    most four of 16 points, and 14,892 of at most six; of many points fewer are left
-    out, so that there are at most CHOICES (four of 50 points, two of 200).
+    What a choice S leaves of Σ r² (r in units of sigma) is first computed from the
+    solution of all points, to first order: Ω - r_S' (I - H_SS)⁻¹ r_S, H = A N⁻¹ A'
+    (Cook and Weisberg 1982). The best `shortlist` of every number of omissions are then
+    solved by `iterations` Gauss-Newton steps. A choice passes if Σ r² is at most the
+    chi-squared value of `level` for its n - 5 degrees of freedom. At least `least`
+    points stay. If no choice passes, the outcome is `no_choice` and nothing is
+    rejected. There are 2,516 choices of at most four of 16 points, and 14,892 of at
+    most six. For many points `most` is lowered so that there are at most CHOICES (four
+    of 50 points, two of 200).
     """
 
     most: int = 4
@@ -56,115 +54,112 @@ class AllSubsets(AbstractProcedure):
     start: AbstractStart = Vertical()
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = scaled(mask_unusable(pair)[0], self.sigma)
-        n = pair.x_left.shape[0]
-        most = min(self.most, max(n - self.least, 0))
-        while sum(comb(n, k) for k in range(most + 1)) > CHOICES:
-            most -= 1
+        pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
-        used = count(fixed.mask)
-        begin = orient(fixed, start=self.start(fixed).pose).pose
-
-        def left_over(omitted):
-            """Σ r² without these points."""
-            use, pose = fixed.mask & ~omitted, begin
-            for _ in range(self.iterations):
-                pose = improved(fixed, pose, use)
-            allowed = (count(omitted & ~fixed.mask) == 0) & (
-                used - count(omitted) >= self.least
-            )
-            squares = total(jnp.where(use, linearised(fixed, pose).squares, 0.0))
-            return jnp.where(allowed & jnp.isfinite(squares), squares, jnp.inf)
+        pose = orient(fixed, start=self.start(fixed).pose).pose
+        choices = self._shortlists(fixed, linearised(fixed, pose))
 
         def best_of(carry, omitted):
-            squares = jax.vmap(left_over)(omitted)
-            first = jnp.arange(len(squares)) == jnp.argmin(squares)
-            return carry, (jnp.min(squares), jnp.any(first[:, None] & omitted, axis=0))
+            left = jax.vmap(lambda out: self._left_over(fixed, pose, out))(omitted)
+            first = jnp.arange(len(left)) == jnp.argmin(left)
+            return carry, (jnp.min(left), jnp.any(first[:, None] & omitted, axis=0))
 
-        _, (squares, choices) = lax.scan(
-            best_of, None, self._shortlists(fixed, linearised(fixed, begin), most)
-        )
-        value = lambda m: critical_values.chi_squared(
-            self.level, jnp.maximum(m - 5, 1.0)
-        )
-        passes = squares <= jnp.stack(
-            [critical_values.by_count(value, n, used - k) for k in range(most + 1)]
-        )
-        fewest = (jnp.arange(most + 1) == jnp.argmax(passes)) & passes
-        return self._ended(
-            pair, jnp.any(fewest[:, None] & choices, axis=0), jnp.any(passes)
-        )
+        _, (left, best) = lax.scan(best_of, None, choices)
+        passes = left <= self._limits(fixed, len(choices))
+        fewest = (jnp.arange(len(choices)) == jnp.argmax(passes)) & passes
+        omitted = jnp.any(fewest[:, None] & best, axis=0)
+        return self._conclude(pair, omitted, jnp.any(passes))
 
-    def _shortlists(
-        self, pair: Pair, linear: Linear, most: int
-    ) -> Bool[Array, "size choice point"]:
-        """The most promising choices of each number of omissions, repeated where there
-        are fewer."""
+    def _most(self, points: int) -> int:
+        """How many points may be omitted of so many."""
+        most = min(self.most, max(points - self.least, 0))
+        while sum(comb(points, k) for k in range(most + 1)) > CHOICES:
+            most -= 1
+        return most
+
+    def _left_over(
+        self, pair: Pair, pose: RelativePose, omitted: Use
+    ) -> Float[Array, ""]:
+        """Σ (r / sigma)² without these points; infinite if they cannot be omitted."""
+        use = pair.mask & ~omitted
+        for _ in range(self.iterations):
+            pose = improve(pair, pose, use)
+        left = sum_of(linearised(pair, pose).squares, use)
+        masked = count(omitted & ~pair.mask) > 0
+        enough = count(pair.mask) - count(omitted) >= self.least
+        return jnp.where(enough & ~masked & jnp.isfinite(left), left, jnp.inf)
+
+    def _limits(self, pair: Pair, numbers: int) -> Float[Array, "number"]:
+        """The critical values of Σ (r / sigma)² after 0, 1, ... omissions."""
+        value = lambda n: critical_values.chi_squared(
+            self.level, jnp.maximum(n - 5, 1.0)
+        )
+        points, used = pair.x_left.shape[0], count(pair.mask)
+        limits = [
+            critical_values.by_count(value, points, used - k) for k in range(numbers)
+        ]
+        return jnp.stack(limits)
+
+    def _shortlists(self, pair: Pair, linear: Linear) -> Choices:
+        """The most promising choices of each number of omissions, some of them repeated
+        where there are fewer."""
+        n = pair.x_left.shape[0]
         root = jnp.sqrt(linear.weight)
-        r = linear.g * root
+        residuals = linear.g * root
         columns = [column * root for column in linear.columns]
-        z = substitute(
-            cholesky(
-                accumulate([linear.g], [[c] for c in linear.columns], [linear.weight])[
-                    0
-                ]
-            )[0],
-            columns,
-        )
-        h = sum(a[:, None] * b[None, :] for a, b in zip(columns, z, strict=True))
-        n = len(r)
+        factor, _ = cholesky(normal_equations(linear, linear.weight)[0])
+        solved = substitute(factor, columns)
+        hat = jnp.zeros((n, n))
+        for column, z in zip(columns, solved, strict=True):
+            hat = hat + column[:, None] * z[None, :]
+        numbers = jnp.arange(n)[None, None, :]
         lists = [jnp.zeros((self.shortlist, n), bool)]
-        for k in range(1, most + 1):
-            choices = np.array(list(combinations(range(n), k))).T
-            block = [
-                [h[i, j] for j in choices[: row + 1]]  # pyright: ignore[reportIndexIssue]
-                for row, i in enumerate(choices)
-            ]
-            gain = _gain(block, [r[i] for i in choices])
-            gain = jnp.where(
-                sum((~pair.mask[i]).astype(gain.dtype) for i in choices) > 0,
-                -jnp.inf,
-                gain,
-            )
-            _, best = lax.top_k(
-                gain.astype(jnp.float32), min(self.shortlist, gain.shape[0])
-            )
-            best = best[np.arange(self.shortlist) % best.shape[0]]
-            points = jnp.asarray(choices.T)[best]
-            lists.append(
-                jnp.any(points[:, :, None] == jnp.arange(n)[None, None, :], axis=1)
-            )
+        for k in range(1, self._most(n) + 1):
+            choices = np.array(list(combinations(range(n), k)))
+            gain = _gain(hat, residuals, choices)
+            masked = sum((~pair.mask[i]).astype(gain.dtype) for i in choices.T)
+            gain = jnp.where(masked > 0, -jnp.inf, gain)
+            taken = min(self.shortlist, len(choices))
+            _, best = lax.top_k(gain.astype(jnp.float32), taken)
+            repeated = best[np.arange(self.shortlist) % taken]
+            points = jnp.asarray(choices)[repeated]
+            lists.append(jnp.any(points[:, :, None] == numbers, axis=1))
         return jnp.stack(lists)
 
-    def _ended(
-        self, pair: Pair, omitted: Bool[Array, "point"], found: Bool[Array, ""]
-    ) -> Rejection:
+    def _conclude(self, pair: Pair, omitted: Use, found: Bool[Array, ""]) -> Rejection:
         use = pair.mask & ~omitted
+        kept = pair.with_mask(use)
         # the optimum does not depend on where it is sought
-        solved = orient(
-            pair.with_mask(use),
-            start=self.start(lax.stop_gradient(pair.with_mask(use))).pose,
+        start = self.start(lax.stop_gradient(kept)).pose
+        solved = orient(kept, start=start)
+        w = normalised_residuals(linearised(pair, solved.pose), use)
+        only = Round(
+            statistic=jnp.where(pair.mask, w, 0.0),
+            limit=critical_values.normal(self.level) + 0 * count(use),
+            rejected=omitted & pair.mask,
+            parallax=solved.parallax,
+            elements=independent_values(solved.pose),
         )
-        w = jnp.where(pair.mask, normalised(linearised(pair, solved.pose), use), 0.0)
-        limit = critical_values.by_count(
-            lambda m: critical_values.normal(self.level + 0 * m), 1, count(use) * 0
-        )
-        new = Round(
-            w, limit, omitted & pair.mask, solved.parallax, independent(solved.pose)
-        )
-        outcome = OUTCOMES.where(found, finished(pair), OUTCOMES.no_choice)
-        return ended(recorded(began(pair, 1), new), solved, outcome)
+        finished = finished_outcome(pair)
+        outcome = OUTCOMES.where(found, finished, OUTCOMES.no_choice)
+        return conclude_round(pair, only, solved, outcome)
 
 
-def _gain(h: list[list[Array]], r: list[Array]) -> Float[Array, "choice"]:
-    """r' (I - H)⁻¹ r of every choice; none where the other points do not determine the
-    orientation without it."""
-    factor, pivot = cholesky(
-        [
-            [1 - a if i == j else -a for j, a in enumerate(row)]
-            for i, row in enumerate(h)
-        ]
-    )
+def _gain(
+    hat: Float[Array, "point point"],
+    residuals: Float[Array, "point"],
+    choices: np.ndarray,
+) -> Float[Array, "choice"]:
+    """r_S' (I - H_SS)⁻¹ r_S of every choice S; minus infinity where the other points
+    do not determine the orientation."""
+    places = choices.T
+    identity = np.eye(len(places))
+    left_over = [
+        [identity[row, column] - hat[i, places[column]] for column in range(row + 1)]
+        for row, i in enumerate(places)
+    ]
+    r = [residuals[i] for i in places]
+    factor, pivot = cholesky(left_over)
     solved = substitute(factor, r)
-    gain = sum(a * b for a, b in zip(r, solved, strict=True))
+    gain = inner(r, solved)
     return jnp.where(pivot > SINGULAR**0.5, gain, -jnp.inf)

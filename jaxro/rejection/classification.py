@@ -29,12 +29,12 @@ from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation import planes
 from ..orientation.results import RESULTS, is_usable
-from ..orientation.starts.general import rotation_only
+from ..orientation.starts.general import rotation_only, vectors
 from ..xla.kernels import while_loop
 from ..xla.passes import count, total
 from . import OUTCOMES, Recommended, Rejection, evidence
-from .hypotheses import squares, vectors
-from .robust import agreeing, in_front, parallel, seen
+from .agreement import keep_agreeing, squares
+from .visibility import in_front, parallel, seen
 
 ENGINE = Recommended()
 """The procedure that decides on pose and matches; the standard deviations are those of
@@ -166,7 +166,7 @@ def in_plane(
         more = count(flat.within & in_front(inside, other)) > count(
             flat.within & in_front(inside, pose)
         )
-        other, others = agreeing(
+        other, others = keep_agreeing(
             inside, other, inside.mask & flat.within, limit, ROUNDS
         )
         others = others & seen(inside, other, limit)
@@ -216,7 +216,7 @@ def certain(
     once = mask_unusable(pair.with_mask(pair.mask & ~again))[0]
     agreed, asked = evidence.shifted_agreement(once, pose, limit)
     chance = (agreed + 1) / (asked + 2)
-    return evidence.accidents(
+    return evidence.log_accidents(
         chance, count(once.mask), count(use & once.mask)
     ) <= math.log(ACCIDENTS)
 

@@ -1,4 +1,4 @@
-"""The algorithm proposed in 1971, and the count of its iterations.
+"""The algorithm proposed in 1971, and how its iterations are counted.
 
 The paper asks for two iterations before a point is judged, and says that "the first
 iteration is the one in which the elements are zero". Its table 2 prints under iteration
@@ -10,51 +10,60 @@ elements: `Dorozhinsky()`. `Dorozhinsky(corrections=2)` is the other reading, wh
 rejects good points in place of wrong ones in table 1 of the paper.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
 
 from ..geometry.elements import AbstractElements
 from ..geometry.pairs import Pair, mask_unusable
 from ..xla.kernels import while_loop
 from ..xla.passes import count
-from .base import (
-    OUTCOMES,
-    AbstractProcedure,
+from .base import OUTCOMES, AbstractProcedure, Rejection
+from .masked import mean_of
+from .parallaxes import adjust_parallaxes, iterate_once, parallaxes, zero_elements
+from .rounds import (
     History,
-    Rejection,
     Round,
-    at_most,
-    began,
-    by_parallax,
-    ended,
-    finished,
-    iterated,
+    add_round,
+    conclude,
+    element_values,
+    empty_history,
+    finished_outcome,
+    keep_at_least,
     largest,
-    mean_of,
-    parallaxes,
-    recorded,
-    values,
-    zero_elements,
 )
 
 CONVERGENCE = 10
 """Corrections allowed after the last rejection by the mean; three are usual."""
 
 
+class State(NamedTuple):
+    """Between two steps: what was decided so far, the elements, whether an operator is
+    needed, and whether the current step goes on."""
+
+    history: History
+    elements: AbstractElements
+    stuck: Bool[Array, ""]
+    going: Bool[Array, ""]
+
+
 class Dorozhinsky(AbstractProcedure):
-    """Five steps (Dorozhinsky 1971, eqs 11 to 13), from zero elements:
+    """The proposed algorithm (Dorozhinsky 1971, eqs 11 to 13), from zero elements:
 
     1. points with |q| > eps1 go, once;
     2. `corrections` corrections of the elements;
-    3. while mean |q| > eps3 the point with the largest |q| goes, and 2 is repeated from
-       zero; with `least` points left the outcome is `operator_needed`;
+    3. while mean |q| > eps3 the point with the largest |q| goes, and step 2 begins
+       again from zero; with `least` points left the outcome is `operator_needed`;
     4. corrections until no element changes by eps2;
-    5. points with |q| - mean |q| >= eps4 go, once, at least `least` stay; new solution.
+    5. points with |q| - mean |q| >= eps4 go, once; at least `least` stay; then the
+       points kept are solved again.
 
-    The log has a round per correction: parallaxes before it, elements after it, as in
-    table 2; and one per decision.
+    The log has a round for each correction, with the parallaxes before it and the
+    elements after it, as in table 2, and a round for each decision.
 
     One correction leaves the terms of second order of the elements in the parallaxes.
-    Where these exceed eps3, the procedure rejects good points or calls the operator: it
+    If these exceed eps3, the procedure rejects good points or calls the operator: it
     needs photos that are nearly parallel, or coordinates that were turned by
     approximate elements.
     """
@@ -68,70 +77,120 @@ class Dorozhinsky(AbstractProcedure):
 
     def __call__(self, pair: Pair) -> Rejection:
         pair = mask_unusable(pair)[0]
-        zero = zero_elements(pair)
-        cycles = max(pair.x_left.shape[0] - self.least, 0) + 1
-        history = began(pair, 1 + cycles * (self.corrections + 1) + CONVERGENCE + 1)
-        first = jnp.abs(parallaxes(pair, pair.mask, zero))
-        gross = pair.mask & (first > self.eps1)
-        history = recorded(
-            history, Round(first, jnp.asarray(self.eps1), gross, first, values(zero))
+        history = self._reject_gross(pair)
+        state = self._reject_by_mean(pair, history)
+        stuck = state.stuck
+        history, elements = self._converge(pair, state)
+        history = self._reject_small(pair, history, elements, ~stuck)
+        final = adjust_parallaxes(pair, history.mask, elements)
+        outcome = OUTCOMES.where(
+            stuck, OUTCOMES.operator_needed, finished_outcome(pair)
         )
+        return conclude(history, final, outcome)
 
-        def cycle(state):
-            history, *_ = state
-            elements = zero
+    def _reject_gross(self, pair: Pair) -> History:
+        """Step 1, with room in the log for all steps."""
+        cycles = max(pair.x_left.shape[0] - self.least, 0) + 1
+        rounds = 1 + cycles * (self.corrections + 1) + CONVERGENCE + 1
+        zero = zero_elements(pair)
+        q = parallaxes(pair, pair.mask, zero)
+        size = jnp.abs(q)
+        gross = Round(
+            statistic=size,
+            limit=jnp.asarray(self.eps1),
+            rejected=pair.mask & (size > self.eps1),
+            parallax=size,
+            elements=element_values(zero),
+        )
+        return add_round(empty_history(pair, rounds), gross)
+
+    def _reject_by_mean(self, pair: Pair, history: History) -> State:
+        """Steps 2 and 3: the elements after the last corrections, and whether an
+        operator is needed."""
+        zero = zero_elements(pair)
+
+        def cycle(state: State) -> State:
+            history, elements = state.history, zero
             for _ in range(self.corrections):
-                history, elements = self._correction(pair, history, elements)
-            q = parallaxes(pair, history.mask, elements)
-            mean = mean_of(jnp.abs(q), history.mask)
-            wrong, few = mean > self.eps3, count(history.mask) <= self.least
-            out = largest(jnp.abs(q), history.mask) & wrong & ~few
-            # the mean decides whether, the size which: a point's statistic is its size,
-            # or zero while the mean is good
-            statistic = jnp.where(wrong, jnp.abs(q), 0.0)
-            new = Round(statistic, jnp.asarray(self.eps3), out, q, values(elements))
-            # what no elements can be determined from is no case for the operator
-            solvable = count(history.mask) >= 5
-            return (
-                recorded(history, new),
-                elements,
-                wrong & few & solvable,
-                ~wrong | few,
+                history, elements = self._correct(pair, history, elements)
+            mask = history.mask
+            q = parallaxes(pair, mask, elements)
+            size = jnp.abs(q)
+            wrong = mean_of(size, mask) > self.eps3
+            few = count(mask) <= self.least
+            # the mean decides whether a point goes, the size which: the statistic of a
+            # point is its size, or zero while the mean is good
+            decision = Round(
+                statistic=jnp.where(wrong, size, 0.0),
+                limit=jnp.asarray(self.eps3),
+                rejected=largest(size, mask) & wrong & ~few,
+                parallax=q,
+                elements=element_values(elements),
+            )
+            # too few points for any elements are no case for the operator
+            solvable = count(mask) >= 5
+            return State(
+                history=add_round(history, decision),
+                elements=elements,
+                stuck=wrong & few & solvable,
+                going=wrong & ~few,
             )
 
         no = jnp.zeros_like(pair.focal_left, bool)
-        state = while_loop(
-            lambda state: ~state[3], cycle, (history, zero, no, no), pair.focal_left
-        )
-        history, elements, stuck, _ = state
+        start = State(history=history, elements=zero, stuck=no, going=~no)
+        return while_loop(lambda state: state.going, cycle, start, pair.focal_left)
 
-        def converge(state):
-            history, elements, _, taken = state
-            history, new = self._correction(pair, history, elements)
-            change = jnp.max(jnp.abs(values(new) - values(elements)))
-            return history, new, change >= self.eps2, taken + 1
+    def _converge(self, pair: Pair, state: State) -> tuple[History, AbstractElements]:
+        """Step 4; nothing happens where an operator is needed."""
 
-        go = ~stuck
-        state = (history, elements, go, history.rounds * 0)
-        history, elements, _, _ = while_loop(
-            lambda s: s[2] & (s[3] < CONVERGENCE), converge, state, pair.focal_left
-        )
+        def more(loop: tuple[State, Int[Array, ""]]) -> Bool[Array, ""]:
+            state, taken = loop
+            return state.going & (taken < CONVERGENCE)
+
+        def body(loop: tuple[State, Int[Array, ""]]) -> tuple[State, Int[Array, ""]]:
+            state, taken = loop
+            history, new = self._correct(pair, state.history, state.elements)
+            moved = element_values(new) - element_values(state.elements)
+            going = jnp.max(jnp.abs(moved)) >= self.eps2
+            state = State(history=history, elements=new, stuck=state.stuck, going=going)
+            return state, taken + 1
+
+        start = state._replace(going=~state.stuck), state.history.rounds * 0
+        state, _ = while_loop(more, body, start, pair.focal_left)
+        return state.history, state.elements
+
+    def _reject_small(
+        self,
+        pair: Pair,
+        history: History,
+        elements: AbstractElements,
+        active: Bool[Array, ""],
+    ) -> History:
+        """The rejection of step 5."""
         q = parallaxes(pair, history.mask, elements)
-        excess = jnp.abs(q) - mean_of(jnp.abs(q), history.mask)
-        bad = history.mask & (excess >= self.eps4)
-        bad = at_most(bad, jnp.abs(q), history.mask, self.least)
-        history = recorded(
-            history, Round(excess, jnp.asarray(self.eps4), bad, q, values(elements)), go
+        size = jnp.abs(q)
+        excess = size - mean_of(size, history.mask)
+        wrong = history.mask & (excess >= self.eps4)
+        decision = Round(
+            statistic=excess,
+            limit=jnp.asarray(self.eps4),
+            rejected=keep_at_least(self.least, wrong, size, history.mask),
+            parallax=q,
+            elements=element_values(elements),
         )
-        outcome = OUTCOMES.where(stuck, OUTCOMES.operator_needed, finished(pair))
-        return ended(history, by_parallax(pair, history.mask, elements), outcome)
+        return add_round(history, decision, active)
 
-    def _correction(
+    def _correct(
         self, pair: Pair, history: History, elements: AbstractElements
     ) -> tuple[History, AbstractElements]:
-        new = iterated(pair, history.mask, elements)
+        """One correction of the elements, which is a round without a decision."""
+        new = iterate_once(pair, history.mask, elements)
         q = parallaxes(pair, history.mask, elements)
-        none = jnp.zeros_like(history.mask)
-        return recorded(
-            history, Round(jnp.abs(q), jnp.asarray(jnp.inf), none, q, values(new))
-        ), new
+        iteration = Round(
+            statistic=jnp.abs(q),
+            limit=jnp.asarray(jnp.inf),
+            rejected=jnp.zeros_like(history.mask),
+            parallax=q,
+            elements=element_values(new),
+        )
+        return add_round(history, iteration), new

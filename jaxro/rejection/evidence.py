@@ -1,11 +1,13 @@
-"""What speaks for an orientation that a search has found: noise, and how likely it is
-that the points agree by chance.
+"""The evidence for an orientation that a search has found: how well the points kept
+fit, and how likely it is that they agree by chance.
 
-Right points under a wrong orientation are no independent accidents: those of one depth
-agree with it together. The number of points that agree proves nothing by itself,
-therefore, unless the search was thorough enough to have met the better orientation, and
-unless the chance of agreement is measured on the scene itself.
+Right points under a wrong orientation are no independent accidents: right points of one
+depth agree with it together. The number of points that agree proves nothing by itself,
+therefore. It proves something if the search was thorough enough to have met a better
+orientation, and if the chance of agreement is measured on the scene itself.
 """
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -15,27 +17,47 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
-from ..xla.passes import count, total
-from .hypotheses import moved_up, squares
+from ..xla.passes import count
+from .agreement import points_within
+from .masked import Use, Values, mean_of, sum_of
+from .subsets import move_up_coordinates
 
-Values = Float[Array, "point"]
-Use = Bool[Array, "point"]
+DEVIATIONS = 3.0
+"""The level of the global test, as a multiple of the standard deviation of a normal
+number."""
 
 SHIFTS, TRIALS = 8, 4096
-"""Other partners that each point is given: at least so many, more where there are few
-points, to make so many trials.
-"""
+"""Other partners that each point is given: at least SHIFTS, and for few points so many
+that there are TRIALS in all."""
 
 PARTS = [2 ** (-k / 4) for k in range(14)]
-"""Of the limit, down to a tenth, within which points are counted: below it none is
-nearer by more than accident."""
+"""Parts of the limit within which points are counted, down to a tenth: below it points
+are no nearer than by accident."""
 
 
 def chi_squared_limit(deviations: float, freedom: Float[Array, ""]) -> Float[Array, ""]:
-    """What chi-squared exceeds as seldom as a normal number so many standard
-    deviations, to a few per cent (Wilson and Hilferty 1931)."""
+    """The value that chi-squared exceeds as seldom as a normal number exceeds so many
+    standard deviations, to a few per cent (Wilson and Hilferty 1931)."""
     part = 2 / (9 * jnp.maximum(freedom, 1.0))
     return freedom * (1 - part + deviations * jnp.sqrt(part)) ** 3
+
+
+def misfit(squares: Values, use: Use) -> Float[Array, ""]:
+    """Σ (r / sigma)² of the points in use: the statistic of the global test."""
+    return sum_of(squares, use)
+
+
+def fits_well(squares: Values, use: Use) -> Bool[Array, ""]:
+    """Whether the points in use pass the global test: their misfit is not too large."""
+    freedom = count(use) - 5
+    return misfit(squares, use) <= chi_squared_limit(DEVIATIONS, freedom)
+
+
+def fits_too_well(squares: Values, use: Use) -> Bool[Array, ""]:
+    """Whether the misfit is so small that sigma must be too large, which hides wrong
+    points from the global test."""
+    freedom = count(use) - 5
+    return misfit(squares, use) < chi_squared_limit(-DEVIATIONS, freedom)
 
 
 def shifted_agreement(
@@ -43,115 +65,123 @@ def shifted_agreement(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """How many points agree with a pose when every point is given the partner of
     another one, and of how many."""
-    rows, n = moved_up(pair), count(pair.mask)
-    size = rows.shape[0]
+    n = count(pair.mask)
+    rows = move_up_coordinates(pair)
+    size = len(rows)
     there = jnp.arange(size, dtype=n.dtype) < n
-    shifts = max(min(max(SHIFTS, TRIALS // size), size - 1), 1)
-    twice = [jnp.concatenate([a, a]) for a in (rows[:, 2], rows[:, 3], there)]
+    shifts = max(SHIFTS, TRIALS // size)
+    shifts = max(min(shifts, size - 1), 1)
+    twice = jnp.concatenate([rows[:, 2:], rows[:, 2:]])
+    there_twice = jnp.concatenate([there, there])
 
-    def shifted(i, sums):
-        # the places are turned, the empty ones with them: a shift by the number of
+    def shift(i, sums):
+        # all places are turned, the empty ones with them: a shift by the number of
         # points would have to gather
-        x, y, also = (
-            lax.dynamic_slice_in_dim(a, 1 + i * (size - 1) // shifts, size)
-            for a in twice
+        begin = 1 + i * (size - 1) // shifts
+        partners = lax.dynamic_slice_in_dim(twice, begin, size)
+        also = lax.dynamic_slice_in_dim(there_twice, begin, size)
+        mixed = dataclasses.replace(
+            pair,
+            x_left=rows[:, 0],
+            y_left=rows[:, 1],
+            x_right=partners[:, 0],
+            y_right=partners[:, 1],
+            mask=there & also,
         )
-        mixed = Pair(
-            rows[:, 0],
-            rows[:, 1],
-            x,
-            y,
-            pair.sigma,
-            there & also,
-            pair.focal_left,
-            pair.focal_right,
-        )
-        agree = mixed.mask & (squares(mixed, pose) <= jnp.asarray(limit, n.dtype) ** 2)
-        return tuple(
-            a + count(b) for a, b in zip(sums, (agree, mixed.mask), strict=True)
-        )
+        agree = points_within(mixed, pose, limit)
+        agreed, asked = sums
+        return agreed + count(agree), asked + count(mixed.mask)
 
-    return lax.fori_loop(0, shifts, shifted, (n * 0, n * 0))
+    return lax.fori_loop(0, shifts, shift, (n * 0, n * 0))
 
 
-def scattered(squares: Values, out: Use, limit: Float[Array, ""]) -> Float[Array, ""]:
-    """The chance that a wrong point agrees, from how far those lie that are out: limit
-    / (mean |r| / sigma).
+def chance_by_distance(
+    squares: Values, out: Use, limit: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The chance that a wrong point agrees, from the distances of the points that are
+    out: limit / (mean |r| / sigma).
 
-    It is twice that of points spread evenly up to twice their mean distance, since
-    small distances are more frequent.
+    It is twice the chance of points spread evenly up to twice their mean distance,
+    since small distances are more frequent.
     """
-    mean = total(jnp.where(out, jnp.sqrt(squares), 0.0)) / jnp.maximum(count(out), 1.0)
+    mean = mean_of(jnp.sqrt(squares), out)
     return limit / jnp.maximum(mean, 2 * limit)
 
 
-def accidents(
+def log_accidents(
     chance: Float[Array, ""], of: Float[Array, ""], kept: Float[Array, ""]
 ) -> Float[Array, ""]:
     """Logarithm of the expected number of sets as good by accident (Moisan and Stival
     2004),
 
-    C(n, k) C(k, 5) p^(k-5) (n - 5),
+        C(n, k) C(k, 5) p^(k-5) (n - 5),
 
-    `kept` = k of n points agree with an orientation of five of them, each other one
-    with the probability `chance`.
+    where k = `kept` of n = `of` points agree with an orientation of five of them, and
+    each other point agrees with the probability p = `chance`.
     """
     k = jnp.maximum(kept, 5.0)
-    choices = gammaln(of + 1) - gammaln(of - k + 1) - gammaln(6.0) - gammaln(k - 4)
-    value = choices + (k - 5) * jnp.log(chance) + jnp.log(jnp.maximum(of - 5, 1.0))
+    # C(n, k) C(k, 5) without the factor k! that both have
+    choices = gammaln(of + 1) - gammaln(of - k + 1)
+    choices = choices - gammaln(6.0) - gammaln(k - 4)
+    orientations = jnp.log(jnp.maximum(of - 5, 1.0))
+    agreement = (k - 5) * jnp.log(chance)
+    value = choices + agreement + orientations
     return jnp.where(kept > 5, value, jnp.inf)
 
 
-def least_accidents(
+def log_least_accidents(
     squares: Values,
     use: Use,
     chance: Float[Array, ""],
     of: Float[Array, ""],
     limit: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    """Logarithm of the expected number of accidents of the points within a part of the
-    limit, for the part for which it is least; `squares` = (r / sigma)².
+    """The least `log_accidents` of the points within a part of the limit, over all
+    PARTS; `squares` = (r / sigma)².
 
     Another point lies within a part of the limit with that part of the `chance` that it
     lies within the limit (Moisan and Stival 2004). So right points that lie well within
-    it are the stronger evidence for it, and sigma need not be known well.
+    it are the stronger evidence, and sigma need not be known well.
     """
 
     def within(part):
         kept = count(use & (squares <= (part * limit) ** 2))
-        return accidents(chance * part, of, kept)
+        return log_accidents(chance * part, of, kept)
 
-    return jnp.min(jax.vmap(within)(jnp.asarray(PARTS, squares.dtype)))
+    parts = jnp.asarray(PARTS, squares.dtype)
+    return jnp.min(jax.vmap(within)(parts))
 
 
-def fewest(
+def fewest_points(
     chance: Float[Array, ""], of: Float[Array, ""], most: Float[Array, ""], size: int
 ) -> Float[Array, ""]:
-    """The fewest points that are no accident: whose expected number of sets as good is
-    at most exp(`most`), if they lie within half of the limit."""
+    """The fewest points that are no accident, if they lie within half of the limit:
+    their `log_accidents` are at most `most`."""
     kept = jnp.arange(6, size + 6, dtype=of.dtype)
-    fine = (jax.vmap(lambda k: accidents(chance / 2, of, k))(kept) <= most) & (
-        kept <= of
-    )
-    return jnp.where(jnp.any(fine), kept[jnp.argmax(fine)], of)
+    expected = lambda k: log_accidents(chance / 2, of, k)
+    fine = (jax.vmap(expected)(kept) <= most) & (kept <= of)
+    first = kept[jnp.argmax(fine)]
+    return jnp.where(jnp.any(fine), first, of)
 
 
-def repeats(pair: Pair) -> tuple[Use, Float[Array, "point"]]:
-    """The points that repeat an earlier one, which is no evidence of its own, and a
-    number that tells them apart."""
-    # what repeats another point is like it in any number made of its coordinates
+def repeats(pair: Pair) -> tuple[Use, Values]:
+    """The points that repeat an earlier one, and a key that is equal for equal points.
+    A repeated point is no evidence of its own."""
     key = jnp.zeros_like(pair.sigma)
     for k, c in enumerate(pair.coordinates):
         key = key + c * (k + 0.1) ** 0.5
     order = jnp.argsort(jnp.where(pair.mask, key, jnp.inf), stable=True)
-    sorted_key = key[order]
-    again = jnp.concatenate([jnp.zeros(1, bool), sorted_key[1:] == sorted_key[:-1]])
-    return pair.mask & jnp.zeros_like(pair.mask).at[order].set(again), key
+    in_order = key[order]
+    equal = in_order[1:] == in_order[:-1]
+    again = jnp.concatenate([jnp.zeros(1, bool), equal])
+    none = jnp.zeros_like(pair.mask)
+    return pair.mask & none.at[order].set(again), key
 
 
 def with_repeats(use: Use, again: Use, key: Values) -> Use:
-    """The points in use, and those that repeat one of them."""
-    order = jnp.argsort(jnp.where(use, key, jnp.inf))
-    used = jnp.where(use[order], key[order], jnp.inf)
-    place = jnp.clip(jnp.searchsorted(used, key), 0, key.shape[0] - 1)
-    return use | (again & (used[place] == key))
+    """The points in use, and the points that repeat one of them."""
+    used = jnp.sort(jnp.where(use, key, jnp.inf))
+    place = jnp.searchsorted(used, key)
+    place = jnp.minimum(place, len(key) - 1)
+    in_use = used[place] == key
+    return use | (again & in_use)

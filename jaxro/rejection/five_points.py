@@ -1,12 +1,13 @@
-"""The orientations of many subsets of five points, solved together: the hypotheses of a
-search.
+"""The orientations of many subsets of five points, solved together: the hypotheses of
+`search`.
 
-The equations are those of `starts.five_point` (Nister 2004). A search can do without
-some solutions if the others come sooner, so that two steps differ. The cubics are
-eliminated without pivots. The real roots of the polynomial of degree ten are sought
-where it changes its sign between NODES places of the projective line, so that two roots
-that lie closer together are lost: one subset of seven loses the right orientation. What
-is found is right to some thousandths.
+The equations, and the functions for them, are those of `orientation.starts.five_point`
+(Nister 2004), which finds every solution exactly. A search can do without some
+solutions if the others come sooner, so that three steps differ here. The null space and
+the cubics are eliminated without pivots. The real roots of the polynomial of degree ten
+are sought where it changes its sign between 2 NODES places of the projective line, so
+that two roots that lie closer together are lost: one subset of seven loses the right
+orientation. The solutions are not polished: they are right to some thousandths.
 
 Arrays carry the subsets on their last axis.
 """
@@ -22,6 +23,7 @@ from ..orientation.starts.decomposition import cofactors
 from ..orientation.starts.five_point import (
     constraints,
     determinant,
+    equations_in_z,
     essential_coefficients,
 )
 from ..orientation.starts.problems_last import cross, merging_last
@@ -33,8 +35,11 @@ NODES = 32
 """Intervals on each half of the projective line: |z| <= |w|, and |z| > |w|."""
 
 NEWTON_STEPS = 3
-TINY = 1e-30
 
+TINY = 1e-30
+"""No pivot and no squared length is taken as smaller than this."""
+
+WIDTH = 2 / NODES
 EDGES = np.linspace(-1, 1, NODES + 1)
 POWERS = EDGES[:, None] ** np.arange(11)
 LEFT_EDGES = np.concatenate([EDGES[:-1], EDGES[:-1]])[:, None]
@@ -45,8 +50,8 @@ Numbers = Float[Array, " subset"]
 
 
 class Solutions(NamedTuple):
-    """Orientations by solution and subset, and which of them exist with all five points
-    in front of both photos."""
+    """Orientations by solution and subset; `exist`: which of them are solutions with
+    all five points in front of both photos."""
 
     rotation: Float[Array, "solution 3 3 subset"]
     base: Float[Array, "solution 3 subset"]
@@ -54,8 +59,8 @@ class Solutions(NamedTuple):
 
 
 class Brackets(NamedTuple):
-    """The intervals in which the polynomial changes its sign: their ordinal numbers (0:
-    no change), where a straight line meets zero, and how many there are."""
+    """The intervals in which the polynomial changes its sign: their ordinal numbers
+    from 1 (0: no change), the zero of the chord over each, and how many there are."""
 
     ordinal: Int[Array, "interval subset"]
     crossing: Float[Array, "interval subset"]
@@ -65,22 +70,22 @@ class Brackets(NamedTuple):
 @merging_last
 def solve(left: Image, right: Image) -> Solutions:
     """The orientations of five points with image vectors (x/f, y/f, -1)."""
-    rows = (left[:, :, None] * right[:, None]).reshape(5, 9, -1)
-    basis = _basis(rows).reshape(4, 3, 3, -1)
-    equations = _eliminated(constraints(basis))
+    products = left[:, :, None] * right[:, None]
+    basis = _basis(products.reshape(5, 9, -1)).reshape(4, 3, 3, -1)
+    equations = _eliminate(constraints(basis))
     polynomial = determinant(equations)
-    brackets = _bracketed(polynomial)
+    brackets = _bracket(polynomial)
 
-    def solution(number: Int[Array, ""]) -> tuple:
+    def solution(number: Int[Array, ""]) -> Solutions:
         z, w = _root(polynomial, brackets, number)
-        coefficients = essential_coefficients(equations, z[None], w[None])
-        essential = jnp.sum(basis * coefficients[:, 0][:, None, None], axis=0)
+        coefficients = essential_coefficients(equations, z[None], w[None])[:, 0]
+        essential = jnp.sum(basis * coefficients[:, None, None], axis=0)
         rotation, base, in_front = _facing(essential, left, right)
-        return rotation, base, in_front & (number < brackets.count)
+        exist = in_front & (number < brackets.count)
+        return Solutions(rotation, base, exist)
 
-    return Solutions(
-        *lax.map(solution, jnp.arange(SOLUTIONS, dtype=brackets.count.dtype))
-    )
+    numbers = jnp.arange(SOLUTIONS, dtype=brackets.count.dtype)
+    return lax.map(solution, numbers)
 
 
 def _basis(rows: Float[Array, "5 9 subset"]) -> Float[Array, "4 9 subset"]:
@@ -90,50 +95,53 @@ def _basis(rows: Float[Array, "5 9 subset"]) -> Float[Array, "4 9 subset"]:
     for k in range(5):
         row = m[k] / _safe(m[k, k])[None]
         this = jnp.asarray(np.arange(5) == k)[:, None, None]
-        m = jnp.where(this, row[None], m - m[:, k][:, None] * row[None])
-    identity = jnp.broadcast_to(
-        jnp.eye(4, dtype=rows.dtype)[:, :, None], (4, 4, rows.shape[-1])
-    )
+        others = m - m[:, k][:, None] * row[None]
+        m = jnp.where(this, row[None], others)
+    bound = -jnp.swapaxes(m[:, 5:], 0, 1)
+    free = jnp.eye(4, dtype=rows.dtype)[:, :, None]
+    free = jnp.broadcast_to(free, (4, 4, rows.shape[-1]))
     found: list[Array] = []
-    for vector in jnp.concatenate([-jnp.swapaxes(m[:, 5:], 0, 1), identity], axis=1):
+    for vector in jnp.concatenate([bound, free], axis=1):
         for other in found:
-            vector = vector - other * jnp.sum(other * vector, axis=0)[None]
+            along = jnp.sum(other * vector, axis=0)
+            vector = vector - other * along[None]
         found.append(_unit(vector))
     return jnp.stack(found)
 
 
-def _eliminated(m: Float[Array, "10 20 subset"]) -> Float[Array, "3 3 5 subset"]:
-    """B(z) of three equations B (x, y, 1)ᵀ = 0, [equation, unknown, power of z], from
-    the last six reduced rows."""
+def _eliminate(m: Float[Array, "10 20 subset"]) -> Float[Array, "3 3 5 subset"]:
+    """B(z) of `equations_in_z`, by elimination without pivots."""
     number = jnp.arange(10)[:, None, None]
 
     def step(k: Int[Array, ""], m: Array) -> Array:
         row = lax.dynamic_index_in_dim(m, k, 0, keepdims=False)
         column = lax.dynamic_index_in_dim(m, k, 1, keepdims=True)
         pivot = lax.dynamic_index_in_dim(row, k, 0, keepdims=True)
-        row = row / _safe(pivot)
-        return jnp.where(number == k, row[None], m - column * row[None])
+        row = (row / _safe(pivot))[None]
+        others = m - column * row
+        return jnp.where(number == k, row, others)
 
-    reduced = lax.fori_loop(0, 10, step, m)[4:, 10:].reshape(3, 2, 10, -1)
-    # ascending powers of z: rows e, f of x²z, x² (then y², xy) combine to e - z f
-    parts = [reduced[:, :, i:j][:, :, ::-1] for i, j in ((0, 3), (3, 6), (6, 10))]
-    columns = [jnp.pad(p, ((0, 0), (0, 0), (0, 5 - p.shape[2]), (0, 0))) for p in parts]
-    b = jnp.stack(columns, axis=1)
-    return b[:, :, 0] - jnp.pad(b[:, :, 1, :-1], ((0, 0), (0, 0), (1, 0), (0, 0)))
+    reduced = lax.fori_loop(0, 10, step, m)
+    return equations_in_z(reduced[4:, 10:])
 
 
-def _bracketed(c: Float[Array, "11 subset"]) -> Brackets:
+def _bracket(c: Float[Array, "11 subset"]) -> Brackets:
     """Where the sum of c_k z^k w^(10-k) changes its sign: for z in [-1, 1] with w = 1,
-    then for w with z = 1."""
+    then for w in [-1, 1] with z = 1."""
     powers = jnp.asarray(POWERS, c.dtype)
-    halves = [jnp.dot(powers, c), jnp.dot(powers, c[::-1])]
-    low = jnp.concatenate([half[:-1] for half in halves])
-    high = jnp.concatenate([half[1:] for half in halves])
+    first = jnp.dot(powers, c)
+    second = jnp.dot(powers, c[::-1])
+    low = jnp.concatenate([first[:-1], second[:-1]])
+    high = jnp.concatenate([first[1:], second[1:]])
     change = (low >= 0) != (high >= 0)
     ordinal = jnp.where(change, jnp.cumsum(change.astype(int), axis=0), 0)
-    share = jnp.where(change, low / jnp.where(change, low - high, 1.0), 0.0)
-    crossing = jnp.asarray(LEFT_EDGES, c.dtype) + share * (2 / NODES)
-    return Brackets(ordinal, crossing, jnp.max(ordinal, axis=0))
+    fall = jnp.where(change, low - high, 1.0)
+    share = jnp.where(change, low / fall, 0.0)
+    return Brackets(
+        ordinal=ordinal,
+        crossing=jnp.asarray(LEFT_EDGES, c.dtype) + share * WIDTH,
+        count=jnp.max(ordinal, axis=0),
+    )
 
 
 def _root(
@@ -142,44 +150,57 @@ def _root(
     """(z, w) of the root in the bracket of this number, by Newton's method kept in the
     bracket."""
     here = brackets.ordinal == number + 1
+    pick = lambda values: jnp.sum(jnp.where(here, values, 0.0), axis=0)
     second = jnp.any(here & jnp.asarray(IN_SECOND_HALF), axis=0)
-    low = jnp.sum(jnp.where(here, jnp.asarray(LEFT_EDGES, c.dtype), 0.0), axis=0)
-    t = jnp.sum(jnp.where(here, brackets.crossing, 0.0), axis=0)
+    low = pick(jnp.asarray(LEFT_EDGES, c.dtype))
+    t = pick(brackets.crossing)
+    ascending = [jnp.where(second, c[10 - k], c[k]) for k in range(11)]
     for _ in range(NEWTON_STEPS):
         value, slope = jnp.zeros_like(t), jnp.zeros_like(t)
-        for k in reversed(range(11)):
+        for coefficient in reversed(ascending):
             slope = slope * t + value
-            value = value * t + jnp.where(second, c[10 - k], c[k])
-        t = jnp.clip(t - value / _safe(slope), low, low + 2 / NODES)
+            value = value * t + coefficient
+        step = value / _safe(slope)
+        t = jnp.clip(t - step, low, low + WIDTH)
     one = jnp.ones_like(t)
     return jnp.where(second, one, t), jnp.where(second, t, one)
 
 
-def _facing(essential: Float[Array, "3 3 subset"], left: Image, right: Image):
+def _facing(
+    essential: Float[Array, "3 3 subset"], left: Image, right: Image
+) -> tuple[Array, Array, Array]:
     """Of the four orientations of E = -[b]x R the one with all points in front, and
-    whether there is one (Horn 1990: cof(E) is b times a row; (b . b) R = cof(E) + [b]x
-    E, and cof(E) - [b]x E for -b)."""
+    whether there is one.
+
+    Horn (1990): cof(E) is b times a row; (b . b) R = cof(E) + [b]x E, and cof(E) - [b]x
+    E for -b.
+    """
     columns = cofactors(essential)
-    rows = jnp.swapaxes(columns, 0, 1)
-    length = jnp.sum(rows * rows, axis=1)
-    first = (length[:1] >= length[1:2]) & (length[:1] >= length[2:])
-    base = _unit(
-        jnp.where(
-            first, rows[0], jnp.where(length[1:2] >= length[2:], rows[1], rows[2])
-        )
-    )
+    base = _longest_row(columns)
     # E has the length of its b, unknown here: with unit b both parts of R need the same
     # scale
-    scale = jnp.sqrt(jnp.maximum(jnp.sum(essential * essential, axis=(0, 1)) / 2, TINY))
+    half = jnp.sum(essential * essential, axis=(0, 1)) / 2
+    scale = jnp.sqrt(jnp.maximum(half, TINY))
     across = cross(base[:, None], essential) * scale[None, None]
-    one, other = columns + across, columns - across
-    (ahead, behind), (also_ahead, also_behind) = (
-        _in_front(r, base, left, right) for r in (one, other)
-    )
+    one = columns + across
+    other = columns - across
+    ahead, behind = _in_front(one, base, left, right)
+    also_ahead, also_behind = _in_front(other, base, left, right)
     second = also_ahead | also_behind
-    rotation = jnp.where(second[None, None], other, one) / (scale * scale)[None, None]
+    rotation = jnp.where(second[None, None], other, one)
+    rotation = rotation / (scale * scale)[None, None]
     turned = jnp.where(second, also_behind, behind)
-    return rotation, jnp.where(turned[None], -base, base), ahead | behind | second
+    base = jnp.where(turned[None], -base, base)
+    return rotation, base, ahead | behind | second
+
+
+def _longest_row(columns: Float[Array, "3 3 subset"]) -> Float[Array, "3 subset"]:
+    """The longest of three rows, given as columns, as a unit vector."""
+    rows = jnp.swapaxes(columns, 0, 1)
+    one, two, three = jnp.sum(rows * rows, axis=1, keepdims=True)
+    first = (one >= two) & (one >= three)
+    other = jnp.where(two >= three, rows[1], rows[2])
+    return _unit(jnp.where(first, rows[0], other))
 
 
 def _in_front(
@@ -187,17 +208,18 @@ def _in_front(
     base: Float[Array, "3 subset"],
     left: Image,
     right: Image,
-):
+) -> tuple[Bool[Array, " subset"], Bool[Array, " subset"]]:
     """Whether all five points lie in front of both photos with the base b, and with
     -b."""
     p1 = jnp.swapaxes(left, 0, 1)
-    p2 = jnp.sum(rotation[:, :, None] * jnp.swapaxes(right, 0, 1)[None], axis=1)
+    p2 = jnp.swapaxes(right, 0, 1)
+    p2 = jnp.sum(rotation[:, :, None] * p2[None], axis=1)
     normal = cross(p1, p2)
-    first = jnp.sum(cross(base[:, None], p2) * normal, axis=0)
-    second = jnp.sum(cross(base[:, None], p1) * normal, axis=0)
-    return jnp.all((first > 0) & (second > 0), axis=0), jnp.all(
-        (first < 0) & (second < 0), axis=0
-    )
+    depth = lambda ray: jnp.sum(cross(base[:, None], ray) * normal, axis=0)
+    first, second = depth(p2), depth(p1)
+    ahead = (first > 0) & (second > 0)
+    behind = (first < 0) & (second < 0)
+    return jnp.all(ahead, axis=0), jnp.all(behind, axis=0)
 
 
 def _safe(pivot: Array) -> Array:
@@ -205,4 +227,5 @@ def _safe(pivot: Array) -> Array:
 
 
 def _unit(vector: Float[Array, "n subset"]) -> Float[Array, "n subset"]:
-    return vector * lax.rsqrt(jnp.maximum(jnp.sum(vector * vector, axis=0), TINY))[None]
+    square = jnp.sum(vector * vector, axis=0)
+    return vector * lax.rsqrt(jnp.maximum(square, TINY))[None]

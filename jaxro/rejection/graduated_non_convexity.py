@@ -9,19 +9,21 @@ from ..geometry.elements import RelativePose
 from ..geometry.linear import linearised
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.starts import AbstractStart, Vertical
+from .agreement import keep_agreeing, state_sigma
 from .base import Rejection
-from .robust import AbstractSearch, agreeing, in_single, judged, reweighted, scaled
+from .steps import geman_mcclure, in_single, step_by_weights
+from .verdict import AbstractSearch, verdict
 
 
 class GraduatedNonConvexity(AbstractSearch):
     """Minimise Σ min(s, c²), s = (r/sigma)², c = `limit`, from absolute residuals over
-    a loss that slowly lets go.
+    a loss that slowly lets go of far points.
 
-    `absolute` steps with weights 1/|r|; `graded` steps of Geman-McClure, weight (k²/(k²
-    + s))², its k falling from `widest` to c in equal ratios; then `rounds` turns of
-    least squares on the points with |w| <= c. Needs no subsets: its work grows with n.
-    From about fifty points it stands half of them wrong; with sixteen, a fifth not
-    always.
+    First come `absolute` steps with weights 1/|r|. Then `graded` steps with the weights
+    of Geman and McClure, (k²/(k² + s))², their k falling from `widest` to c in equal
+    ratios. Last, `rounds` turns of least squares on the points with |w| <= c. No random
+    subsets are needed, so that the work grows with n. With fifty points or more half of
+    them may be wrong; with sixteen points sometimes a fifth is too many.
     """
 
     sigma: float | None = None
@@ -33,27 +35,27 @@ class GraduatedNonConvexity(AbstractSearch):
     start: AbstractStart = Vertical(steps=0)
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = scaled(mask_unusable(pair)[0], self.sigma)
+        pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = self.search(fixed)
         use = fixed.mask & (linearised(fixed, pose).squares <= self.limit**2)
-        return judged(
-            pair, *agreeing(fixed, pose, use, self.limit, self.rounds), self.limit
-        )
+        pose, use = keep_agreeing(fixed, pose, use, self.limit, self.rounds)
+        return verdict(pair, pose, use, self.limit)
 
     def search(self, pair: Pair) -> RelativePose:
         """The pose after all graded steps, which are as good in single precision."""
         single = in_single(pair)
 
-        def absolute(_, pose):
-            return reweighted(single, pose, lambda s: 1 / jnp.sqrt(s + 1))
+        def flatten(_, pose):
+            return step_by_weights(single, pose, lambda s: 1 / jnp.sqrt(s + 1))
 
-        def graded(i, pose):
+        def grade(i, pose):
             share = i.astype(jnp.float32) / max(self.graded - 1, 1)
-            k2 = self.widest**2 * (self.limit / self.widest) ** (2 * share)
-            return reweighted(single, pose, lambda s: (k2 / (k2 + s)) ** 2)
+            variance = self.widest**2 * (self.limit / self.widest) ** (2 * share)
+            return step_by_weights(single, pose, lambda s: geman_mcclure(s, variance))
 
         pose = in_single(self.start(pair).pose)
-        pose = lax.fori_loop(0, self.absolute, absolute, pose)
-        pose = lax.fori_loop(0, self.graded, graded, pose)
-        return jax.tree.map(lambda a: a.astype(pair.focal_left.dtype), pose).normalise()
+        pose = lax.fori_loop(0, self.absolute, flatten, pose)
+        pose = lax.fori_loop(0, self.graded, grade, pose)
+        double = lambda a: a.astype(pair.focal_left.dtype)
+        return jax.tree.map(double, pose).normalise()

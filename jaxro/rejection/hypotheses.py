@@ -1,5 +1,8 @@
-"""Random subsets of a few points and the orientations they have: what `Ransac` and
-`LeastMedian` choose from."""
+"""Orientations of random subsets of a few points: the hypotheses that `Ransac` and
+`LeastMedian` choose from.
+
+Another way to orient a subset is another `AbstractHypotheses`.
+"""
 
 import abc
 from typing import ClassVar
@@ -7,12 +10,11 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ..adjustment.normal_equations import solve
-from ..geometry import coplanarity, rotations as rot
+from ..geometry import rotations as rot
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
 from ..geometry.rotations import Matrix, Vector
@@ -23,6 +25,8 @@ from ..orientation.starts.five_point import five_point
 from ..orientation.starts.general import vectors
 from ..xla.kernels import computed_once
 from ..xla.passes import count
+from .steps import in_single
+from .subsets import choose_places, take_points
 
 Poses = tuple[RelativePose, Bool[Array, "..."]]
 """Orientations on a leading axis, and which of them exist."""
@@ -37,7 +41,7 @@ class AbstractHypotheses(eqx.Module):
 
     @abc.abstractmethod
     def begin(self, pair: Pair) -> RelativePose | None:
-        """What all subsets of a pair begin with."""
+        """The pose from which all subsets of a pair begin, if they need one."""
 
     @abc.abstractmethod
     def __call__(self, subset: Pair, begin: RelativePose | None) -> Poses:
@@ -46,8 +50,8 @@ class AbstractHypotheses(eqx.Module):
 
 
 class FivePoint(AbstractHypotheses):
-    """All real solutions of the five-point problem that have the points in front of
-    both photos: any position."""
+    """All real solutions of the five-point problem with the points in front of both
+    photos, in any position (Nister 2004)."""
 
     size: ClassVar[int] = 5
     block: int = 4
@@ -58,18 +62,17 @@ class FivePoint(AbstractHypotheses):
     def __call__(self, subset: Pair, begin: None) -> Poses:
         left, right = vectors(subset)
         essentials, real = five_point(left, right, polished=False)
-        poses, front = jax.vmap(lambda e: best_pose(e, left, right, subset.mask))(
-            essentials
-        )
+        pose_of = lambda e: best_pose(e, left, right, subset.mask)
+        poses, front = jax.vmap(pose_of)(essentials)
         return poses, real & (front == self.size)
 
 
 class EightPoint(AbstractHypotheses):
-    """The linear solution of eight points and `steps` Gauss-Newton steps on their
-    conditions: any position.
+    """The linear solution of eight points, then `steps` Gauss-Newton steps on their
+    conditions, in any position.
 
-    A fifteenth of the work of `FivePoint`, which outweighs that a subset of eight more
-    often holds a wrong point. Where all points lie near a plane it fails.
+    It is so much quicker than `FivePoint` that this outweighs the larger share of
+    subsets with a wrong point. It fails where all points lie near a plane.
     """
 
     size: ClassVar[int] = 8
@@ -81,25 +84,19 @@ class EightPoint(AbstractHypotheses):
 
     def __call__(self, subset: Pair, begin: None) -> Poses:
         left, right = vectors(subset)
-        pose, front = best_pose(
-            eight_point(left, right, jnp.ones_like(subset.x_left)),
-            left,
-            right,
-            subset.mask,
-        )
-        pose, fine = refined(subset, pose, self.steps)
-        return jax.tree.map(lambda a: a[None], pose), (fine & (front == self.size))[
-            None
-        ]
+        essential = eight_point(left, right, jnp.ones_like(subset.x_left))
+        pose, front = best_pose(essential, left, right, subset.mask)
+        pose, fine = refine(subset, pose, self.steps)
+        return one_place(pose, fine & (front == self.size))
 
 
 class Newton(AbstractHypotheses):
-    """`steps` of Newton's method on the conditions of five points, from `start`: one
-    orientation.
+    """One orientation, by `steps` of Newton's method on the conditions of five points
+    from `start`.
 
-    A fiftieth of the work of `FivePoint`. From the vertical it reaches near-vertical
-    photos; from `General()` photos in any position, if the wrong points leave that
-    start within some 20° of the solution.
+    From the vertical it reaches near-vertical photos. From `General()` it reaches
+    photos in any position, if the wrong points leave that start within some 20° of the
+    solution.
     """
 
     size: ClassVar[int] = 5
@@ -111,126 +108,87 @@ class Newton(AbstractHypotheses):
         return self.start(pair).pose  # pyright: ignore[reportReturnType]
 
     def __call__(self, subset: Pair, begin: RelativePose) -> Poses:
-        pose, fine = refined(subset, begin, self.steps)
-        return jax.tree.map(lambda a: a[None], pose), fine[None]
+        return one_place(*refine(subset, begin, self.steps))
 
 
-def refined(
+def one_place(pose: RelativePose, exists: Bool[Array, ""]) -> Poses:
+    """A single orientation on a leading axis."""
+    return jax.tree.map(lambda a: a[None], (pose, exists))
+
+
+def refine(
     subset: Pair, pose: RelativePose, steps: int
 ) -> tuple[RelativePose, Bool[Array, ""]]:
     """The pose after Gauss-Newton steps on g of a few points, in single precision, and
     whether it is finite."""
-    single = lambda a: a.astype(jnp.float32)
-    left, right = single(subset.focal_left), single(subset.focal_right)
-    points = [
-        tuple(single(c[i]) for c in subset.coordinates)
-        for i in range(subset.x_left.shape[0])
-    ]
-    zero, one = jnp.zeros_like(left), jnp.ones_like(left)
+    single = in_single(subset)
 
-    def condition(turn: Vector, base: Vector, rotation: Matrix, point) -> Array:
-        """g with the right photo turned about its own axes: one gradient, where
-        `pose.moved` takes five slopes."""
-        x1, y1, x2, y2 = point
-        p2 = (x2, y2, -right)
-        turned = tuple(a + b for a, b in zip(p2, rot.cross(turn, p2), strict=True))
-        return rot.dot(base, rot.cross((x1, y1, -left), rot.apply(rotation, turned)))  # pyright: ignore[reportArgumentType]
+    def step(_, pose: RelativePose) -> RelativePose:
+        equations = computed_once(lambda pose: _condition_rows(single, pose))(pose)
+        *normal, (*right_side, _) = computed_once(_normal_sums)(equations)
+        delta = solve(normal, right_side)
+        return pose.move(tuple(-d for d in delta))
 
-    def rows(pose: RelativePose):
-        rotation, base = pose.relative()
-        tangents = rot.tangents(base)
-        each = []
-        for point in points:
-            g, (turn, n) = jax.value_and_grad(condition, argnums=(0, 1))(
-                (zero,) * 3, base, rotation, point
-            )
-            each.append([*turn, *(rot.dot(t, n) for t in tangents), g])
-        return each
-
-    def normal(rows):
-        return [
-            [sum(row[i] * row[j] for row in rows) for j in range(i + 1)]
-            for i in range(6)
-        ]
-
-    def step(_, pose: RelativePose):
-        *n, (*h, _) = computed_once(normal)(computed_once(rows)(pose))
-        return pose.move(tuple(-d for d in solve(n, h)))
-
-    pose = lax.fori_loop(0, steps, step, jax.tree.map(single, pose))
+    pose = lax.fori_loop(0, steps, step, in_single(pose))
     fine = jnp.isfinite(sum(jax.tree.leaves(pose)))
-    return jax.tree.map(
-        lambda a: jnp.where(fine, a, one).astype(subset.focal_left.dtype), pose
-    ).normalise(), fine
+    dtype = subset.focal_left.dtype
+    safe = lambda a: jnp.where(fine, a, jnp.ones_like(a)).astype(dtype)
+    return jax.tree.map(safe, pose).normalise(), fine
 
 
-def draws(
-    hypotheses: AbstractHypotheses, count: int, seed: int
-) -> Float[Array, "block place subset"]:
-    """Uniform random numbers for `count` subsets, the same for every pair."""
-    shape = -(-count // hypotheses.block), hypotheses.size, hypotheses.block
-    return jnp.asarray(np.random.default_rng(seed).random(shape, np.float32))
+def _condition_rows(subset: Pair, pose: RelativePose) -> list[list[Array]]:
+    """Of every point dg/dx by the five local parameters of `pose.moved`, and g.
+
+    The gradient by a turn of the right photo about its own axes and by the base is one
+    pass, where `pose.moved` would take five.
+    """
+    rotation, base = pose.relative()
+    no_turn = (jnp.zeros_like(base[0]),) * 3
+    tangents = rot.tangents(base)
+    gradient = jax.value_and_grad(_condition, argnums=(0, 1))
+    rows = []
+    for x1, y1, x2, y2 in zip(*subset.coordinates, strict=True):
+        left = (x1, y1, -subset.focal_left)
+        right = (x2, y2, -subset.focal_right)
+        g, (by_turn, by_base) = gradient(no_turn, base, rotation, left, right)
+        along = [rot.dot(tangent, by_base) for tangent in tangents]
+        rows.append([*by_turn, *along, g])
+    return rows
 
 
-def subsets(
-    uniform: Float[Array, "place subset"], of: Float[Array, ""]
-) -> Int[Array, "place subset"]:
-    """Different numbers below `of`, as many as there are places, every choice equally
-    likely (Floyd's algorithm: each is drawn from one number more than the one before,
-    and is the new one where it would repeat another)."""
-    taken: list = []
-    for j in reversed(range(uniform.shape[0])):
-        last = jnp.maximum(of.astype(uniform.dtype) - j, 1.0) - 1
-        number = jnp.minimum(jnp.floor(uniform[j] * (last + 1)), last)
-        again = sum(
-            (number == other for other in taken), start=jnp.zeros(number.shape, bool)
-        )
-        taken.append(jnp.where(again, last, number))
-    return jnp.stack(taken).astype(jnp.int32)
+def _condition(
+    turn: Vector, base: Vector, rotation: Matrix, left: Vector, right: Vector
+) -> Array:
+    """g = b . (p1 x R p2) with the right photo turned by a small angle about its own
+    axes."""
+    change = rot.cross(turn, right)
+    turned = tuple(a + b for a, b in zip(right, change, strict=True))
+    return rot.dot(base, rot.cross(left, rot.apply(rotation, turned)))  # pyright: ignore[reportArgumentType]
 
 
-def moved_up(pair: Pair) -> Float[Array, "point 4"]:
-    """The coordinates of the points that take part, moved before all others, so that
-    padding changes no subset."""
-    rows = jnp.stack(pair.coordinates, axis=-1)
-    place = jnp.where(pair.mask, jnp.cumsum(pair.mask) - 1, len(rows))
-    return jnp.zeros_like(rows).at[place].set(rows, mode="drop")
+def _normal_sums(rows: list[list[Array]]) -> list[list]:
+    """The lower triangle of AᵀA, A the matrix of these rows."""
+    return [
+        [sum(row[i] * row[j] for row in rows) for j in range(i + 1)]
+        for i in range(len(rows[0]))
+    ]
 
 
-def chosen(
-    pair: Pair, points: Float[Array, "point 4"], places: Int[Array, "place subset"]
-) -> Pair:
-    """The subsets as pairs of a few points, of unit weight."""
-    few = points.at[places.T].get(mode="clip")
-    focal = lambda f: jnp.broadcast_to(f, few.shape[:1])
-    return Pair(
-        *(few[:, :, k] for k in range(4)),
-        jnp.ones_like(few[:, :, 0]),
-        jnp.ones(few.shape[:2], bool),
-        focal(pair.focal_left),
-        focal(pair.focal_right),
-    )
-
-
-def solutions(
-    hypotheses: AbstractHypotheses, pair: Pair, points, begin, uniform
+def solve_block(
+    hypotheses: AbstractHypotheses,
+    pair: Pair,
+    rows: Float[Array, "point 4"],
+    begin: RelativePose | None,
+    uniform: Float[Array, "n subset"],
 ) -> Poses:
-    """The orientations of a block of subsets, one after another on the leading axis."""
-    few = chosen(pair, points, subsets(uniform, count(pair.mask)))
+    """The orientations of a block of subsets, all on one leading axis."""
+    places = choose_places(uniform, count(pair.mask))
+    few = take_points(pair, rows, places)
     found = jax.vmap(lambda subset: hypotheses(subset, begin))(few)
     return jax.tree.map(lambda a: a.reshape(-1), found)
 
 
-def squares(pair: Pair, pose: RelativePose) -> Float[Array, "point"]:
-    """(r / sigma)² of every point."""
-    residuals = coplanarity.residuals(pair, pose)
-    one = lambda g, d, use: jnp.where(use, g[0] ** 2 / d[0][0], 0.0)
-    return residuals.groups(
-        one, residuals.shared(*(jnp.zeros_like(pair.focal_left),) * 5)
-    )
-
-
-def best(poses: RelativePose, score: Float[Array, "hypothesis"]) -> RelativePose:
-    """The pose with the lowest score."""
-    first = jnp.argmin(score)
+def best(poses: RelativePose, cost: Float[Array, "hypothesis"]) -> RelativePose:
+    """The pose with the lowest cost."""
+    first = jnp.argmin(cost)
     return jax.tree.map(lambda a: a[first], poses)

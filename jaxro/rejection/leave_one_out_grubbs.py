@@ -1,6 +1,7 @@
 """Leave-one-out with Grubbs' test (Burshtynskaya and Tumskaya 1989)."""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,105 +15,127 @@ from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import orient
 from ..xla.kernels import computed_once
 from ..xla.passes import count, sums, total
-from .base import (
-    AbstractProcedure,
-    PointValues,
-    Rejection,
-    Round,
-    began,
-    by_parallax,
-    ended,
-    finished,
-    iterated,
-    largest,
-    mean_of,
+from .base import AbstractProcedure, PointValues, Rejection
+from .masked import mean_of
+from .parallaxes import (
+    adjust_parallaxes,
+    iterate_once,
+    no_displacement,
+    parallax_residuals,
     parallaxes,
-    repeated,
-    residuals_at,
-    values,
 )
+from .rounds import (
+    Round,
+    conclude,
+    element_values,
+    finished_outcome,
+    largest,
+    repeat_rounds,
+)
+from .steps import inner
 
 UNTESTABLE = 1e-3
-"""Redundancy number below which the omission of a point leaves a (nearly) singular
-system: the refits then do not converge in two iterations, and one such row would hide
-all others."""
+"""Redundancy number below which a point is not tested: its omission leaves a (nearly)
+singular system, whose refits do not converge in two iterations, and one such row would
+hide all others."""
 
 ROUNDING = 1e-10
-"""Differences of means (of the unit of the coordinates, or relative to them) that say
-nothing."""
+"""Standard deviation of the means, in units of the coordinates or relative to the
+means, up to which they differ by rounding alone."""
+
+SMALL = 1e-5
+"""Standard deviation of the simulated errors of `calibrate`, as part of the focal
+length: small, so that the equations stay linear."""
 
 Means = tuple[Float[Array, "point"], Bool[Array, "point"]]
+"""Mean |q| after the omission of each point, and whether that can be tested."""
 
 
-def refitted(
+class Influence(NamedTuple):
+    """The parallax adjustment linearised at given elements: q, the columns of A, those
+    of (AᵀA)⁻¹ Aᵀ, and the redundancy numbers 1 - h_ii, H = A (AᵀA)⁻¹ Aᵀ; all zero for
+    points that are not in use."""
+
+    q: PointValues
+    columns: list[PointValues]
+    solved: list[PointValues]
+    redundancy: PointValues
+
+
+def influence(
+    pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements
+) -> Influence:
+    """The influence of the parallaxes of the points in use on the solution."""
+    residuals = parallax_residuals(pair, mask, elements)
+    (q,), jacobian, weight = residuals.columns(no_displacement(pair))
+    n, _, _ = accumulate([q], jacobian, weight)
+    columns = [jnp.where(mask, column, 0.0) for (column,) in jacobian]
+    solved = substitute(cholesky(n)[0], columns)
+    h = inner(columns, solved)
+    return Influence(
+        q=jnp.where(mask, q, 0.0),
+        columns=columns,
+        solved=solved,
+        redundancy=jnp.where(mask, 1 - h, 0.0),
+    )
+
+
+def refit_means(
     pair: Pair,
     mask: Bool[Array, "point"],
     elements: AbstractElements,
     iterations: int = 2,
 ) -> Means:
-    """Mean |q| after the omission of each point in turn (matrix 5 and means 6 of 1989),
-    and whether it can be omitted.
+    """Mean |q| after the omission of each point in turn (matrix 5 and means 6 of 1989).
 
-    All omissions at once, each solved by some iterations from the solution of all
-    points, of which every one squares the error: two leave 1e-6 mm where an error is 2
-    mm, and rounding where it is .2 mm.
+    All omissions are solved at once, each by some iterations from the solution of all
+    points. Every iteration squares the error: two leave 1e-6 mm for a point with an
+    error of 2 mm, and rounding for one with an error of 0.2 mm.
     """
-    out = jnp.eye(mask.shape[0], dtype=bool)
 
-    def one(omitted):
+    def mean_without(omitted):
         use = mask & ~omitted
         solved = elements
         for _ in range(iterations):
-            solved = iterated(pair, use, solved)
-        return total(jnp.abs(parallaxes(pair, use, solved))) / jnp.maximum(
-            count(mask), 1.0
-        )
+            solved = iterate_once(pair, use, solved)
+        left = total(jnp.abs(parallaxes(pair, use, solved)))
+        return left / jnp.maximum(count(mask), 1.0)
 
-    _, _, redundancy = linearised(pair, mask, elements)
-    return jax.vmap(one)(out), mask & (redundancy > UNTESTABLE)
+    redundancy = influence(pair, mask, elements).redundancy
+    omissions = jnp.eye(mask.shape[0], dtype=bool)
+    return jax.vmap(mean_without)(omissions), mask & (redundancy > UNTESTABLE)
 
 
-def closed_form(
+def first_order_means(
     pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements
 ) -> Means:
-    """The same to first order: the omission of i changes q_j by h_ji q_i / r_i, H = A
-    (AᵀA)⁻¹ Aᵀ, r_i = 1 - h_ii.
+    """The same to first order: the omission of i changes q_j by h_ji q_i / r_i, r_i =
+    1 - h_ii.
 
-    It differs from `refitted` where a point has much leverage or the elements change by
-    much.
+    It differs from `refit_means` for points of much leverage, or where the elements
+    change by much.
     """
 
-    def shared(pair, mask, elements):
-        q, (a, z), redundancy = linearised(pair, mask, elements)
-        testable = mask & (redundancy > UNTESTABLE)
-        factor = jnp.where(testable, q / jnp.where(testable, redundancy, 1.0), 0.0)
-        return q, a, [factor * column for column in z], testable
+    def change_elements(pair, mask, elements):
+        found = influence(pair, mask, elements)
+        testable = mask & (found.redundancy > UNTESTABLE)
+        safe = jnp.where(testable, found.redundancy, 1.0)
+        factor = jnp.where(testable, found.q / safe, 0.0)
+        changes = [factor * column for column in found.solved]
+        return found.q, found.columns, changes, testable
 
-    q, a, change, testable = computed_once(shared)(pair, mask, elements)
+    q, columns, changes, testable = computed_once(change_elements)(pair, mask, elements)
 
-    def one(own, *change):
-        moved = q + sum(column * c for column, c in zip(a, change, strict=True))
-        # Σ |moved| as two sums in one pass: a single one XLA computes after all n²
-        # numbers have been written
+    def mean_without(own, *change):
+        moved = q + inner(columns, change)
+        # Σ |moved| as two sums in one pass: as a single sum XLA would compute it after
+        # all n² numbers have been written
         above, below = sums((jnp.maximum(moved, 0.0), jnp.maximum(-moved, 0.0)))
-        # a point not in use has q = a = 0
+        # q and the columns of a point that is not in use are zero
         return (above + below - own) / jnp.maximum(count(mask), 1.0)
 
-    own = jnp.abs(q + sum(x * y for x, y in zip(a, change, strict=True)))
-    return jax.vmap(one)(own, *change), testable
-
-
-def linearised(pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements):
-    """q, (the columns a of A, those of (AᵀA)⁻¹ Aᵀ) and the redundancy numbers 1 -
-    h_ii."""
-    (q,), jacobian, weight = residuals_at(pair, mask, elements).columns(
-        (jnp.zeros_like(pair.focal_left),) * 5
-    )
-    n, _, _ = accumulate([q], jacobian, weight)
-    a = [jnp.where(mask, column, 0.0) for (column,) in jacobian]
-    z = substitute(cholesky(n)[0], a)
-    h = sum(x * y for x, y in zip(a, z, strict=True))
-    return jnp.where(mask, q, 0.0), (a, z), jnp.where(mask, 1 - h, 0.0)
+    own = jnp.abs(q + inner(columns, changes))
+    return jax.vmap(mean_without)(own, *changes), testable
 
 
 def grubbs_statistic(
@@ -121,20 +144,21 @@ def grubbs_statistic(
     """V of every omission: (mean of the means - its mean) / S, eqs (7) to (9)."""
     centre = mean_of(means, use)
     spread = jnp.sqrt(mean_of((means - centre) ** 2, use))
-    # pairs without any error differ by rounding alone
     real = spread > ROUNDING * jnp.maximum(centre, 1.0)
-    return jnp.where(use & real, (centre - means) / jnp.where(real, spread, 1.0), 0.0)
+    v = (centre - means) / jnp.where(real, spread, 1.0)
+    return jnp.where(use & real, v, 0.0)
 
 
 class LeaveOneOutGrubbs(AbstractProcedure):
-    """Omit each point in turn; the omission with the smallest mean |q| is wrong if its
-    V exceeds the critical value.
+    """Omit each point in turn; the point whose omission leaves the smallest mean |q| is
+    wrong if its V exceeds the critical value.
 
-    One point a round, until none is rejected or `least` are left. `exact`: refits, or
-    the closed form. `critical`: by number of points in use, from `calibrated`;
-    otherwise Grubbs' formula at `level`, which takes the means for a normal sample.
-    They are none: at 5 % it rejects a point of nearly half of all pairs without an
-    error. An omission that leaves a singular system is not testable and never judged.
+    One point a round, until none is rejected or `least` are left. `exact`: by refits,
+    else to first order. `critical`: critical values by number of points in use, made by
+    `calibrate`; otherwise Grubbs' formula at `level`, which takes the means for a
+    normal sample. They are none: at 5 % the formula rejects a point of nearly half of
+    all pairs without an error. A point whose omission leaves a singular system is not
+    testable, and never rejected.
     """
 
     level: float = 0.05
@@ -145,32 +169,35 @@ class LeaveOneOutGrubbs(AbstractProcedure):
     def __call__(self, pair: Pair) -> Rejection:
         pair = mask_unusable(pair)[0]
 
-        def judge(mask, history):
-            solved = by_parallax(pair, mask)
+        def judge(mask):
+            solved = adjust_parallaxes(pair, mask)
             v, testable = self.statistic(pair, mask, solved.pose)
             limit = self.limit(pair, mask, testable)
-            out = largest(v, testable) & (v > limit) & (count(mask) > self.least)
-            return Round(v, limit, out, solved.parallax, values(solved.elements))
+            worst = largest(v, testable) & (v > limit)
+            return Round(
+                statistic=v,
+                limit=limit,
+                rejected=worst & (count(mask) > self.least),
+                parallax=solved.parallax,
+                elements=element_values(solved.elements),
+            )
 
-        history = repeated(
-            judge, began(pair, max(pair.x_left.shape[0] - self.least, 0) + 1)
-        )
-        return ended(history, by_parallax(pair, history.mask), finished(pair))
+        history = repeat_rounds(judge, pair, self.least)
+        final = adjust_parallaxes(pair, history.mask)
+        return conclude(history, final, finished_outcome(pair))
 
     def statistic(
         self, pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements
-    ) -> tuple:
-        """V of every point in use, and which can be tested."""
-        means, testable = (refitted if self.exact else closed_form)(
-            pair, mask, elements
-        )
+    ) -> tuple[PointValues, Bool[Array, "point"]]:
+        """V of every point in use, and which points can be tested."""
+        means_without = refit_means if self.exact else first_order_means
+        means, testable = means_without(pair, mask, elements)
         return grubbs_statistic(means, testable), testable
 
     def limit(
         self, pair: Pair, mask: Bool[Array, "point"], testable: Bool[Array, "point"]
     ) -> Float[Array, ""]:
-        """The critical value for so many points in use, of which so many can be
-        tested."""
+        """The critical value for the points in use, of which some can be tested."""
         formula = critical_values.by_count(
             lambda n: critical_values.grubbs(self.level, n),
             pair.x_left.shape[0],
@@ -183,7 +210,7 @@ class LeaveOneOutGrubbs(AbstractProcedure):
         return jnp.where(known > 0, known, formula)
 
 
-def calibrated(
+def calibrate(
     procedure: LeaveOneOutGrubbs,
     pair: Pair,
     key: PRNGKeyArray,
@@ -199,35 +226,23 @@ def calibrated(
     """
     pair = mask_unusable(pair)[0]
     solved = orient(pair)
-    x_left, y_left, x_right, y_right = solved.corrections(pair)
-    exact = plant(pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right)
-    size = 1e-5 * pair.focal_left
+    names = ("x_left", "y_left", "x_right", "y_right")
+    exact = plant(pair, **dict(zip(names, solved.corrections(pair), strict=True)))
+
+    def largest_v(key, omitted):
+        noise, choice = jax.random.split(key)
+        chance = jax.random.uniform(choice, pair.mask.shape, float)
+        rank = jnp.argsort(jnp.argsort(jnp.where(pair.mask, chance, 2.0)))
+        mask = pair.mask & (rank >= omitted)
+        measured = noisy(exact, noise, SMALL * pair.focal_left)
+        pose = adjust_parallaxes(measured, mask, solved.pose).pose
+        return jnp.max(procedure.statistic(measured, mask, pose)[0])
+
+    simulate = jax.jit(jax.vmap(largest_v, (0, None)))
     used = int(count(pair.mask))
     table = jnp.zeros(pair.x_left.shape[0] + 1)
-
-    def one(key, omitted):
-        noise, choice = jax.random.split(key)
-        rank = jnp.argsort(
-            jnp.argsort(
-                jnp.where(
-                    pair.mask, jax.random.uniform(choice, pair.mask.shape, float), 2.0
-                )
-            )
-        )
-        measured = noisy(exact, noise, size)
-        mask = pair.mask & (rank >= omitted)
-        return jnp.max(
-            procedure.statistic(
-                measured, mask, by_parallax(measured, mask, solved.pose).pose
-            )[0]
-        )
-
-    run = jax.jit(jax.vmap(one, (0, None)))
     for omitted in range(min(rounds, max(used - procedure.least, 0)) + 1):
-        largest_v = run(
-            jax.random.split(jax.random.fold_in(key, omitted), trials), omitted
-        )
-        table = table.at[used - omitted].set(
-            jnp.quantile(largest_v, 1 - procedure.level)
-        )
+        keys = jax.random.split(jax.random.fold_in(key, omitted), trials)
+        value = jnp.quantile(simulate(keys, omitted), 1 - procedure.level)
+        table = table.at[used - omitted].set(value)
     return dataclasses.replace(procedure, critical=table)

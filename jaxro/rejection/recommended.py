@@ -8,11 +8,11 @@ against chance.
 3. `Thorough`: the best of what begins at the vertical, held against random subsets in
    any position until a better orientation would have been met.
 
-Every orientation is compared by the same truncated cost. What is found is solved by
-least squares, and every point, in use or not, judged anew by its normalised residual
-|w| at the familywise level, in turns: a good point that a search lost comes back. Where
-few points are out, the same is done point by point from all points, by which few and
-small errors are found best.
+Every orientation is compared by the same truncated cost. The points of the one that is
+found are solved by least squares, and every point, in use or not, is judged anew by its
+normalised residual |w| at the familywise level, in turns: a good point that a search
+lost comes back. Where few points are out, the same is done point by point from all
+points, which finds few and small errors best.
 """
 
 import dataclasses
@@ -21,91 +21,41 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..adjustment import critical_values
 from ..assessment.undecided import undecided
 from ..geometry.elements import RelativePose, vertical
 from ..geometry.linear import linearised
 from ..geometry.pairs import Pair, mask_unusable
 from ..xla.kernels import if_needed
-from ..xla.passes import count, total
-from . import evidence
+from ..xla.passes import count
+from .agreement import familywise_limit, normalised_residuals, state_sigma
 from .base import OUTCOMES, AbstractProcedure, Rejection
-from .fading import faded
-from .graduated_non_convexity import GraduatedNonConvexity
-from .robust import judged, normalised, scaled, seen
-from .search import forward
-from .stages import (
-    DEVIATIONS,
-    FEW,
-    AbstractStage,
-    Decision,
-    Use,
-    believed_if_it_fits,
-    from_vertical,
-    on_a_plane,
-    rescaled,
-    settled,
-)
+from .fading import fade
+from .masked import Use
+from .quick import Plain, Quick
+from .stages import FEW, AbstractStage, Decision, scale_sigma
 from .thorough import Thorough
+from .verdict import verdict
+from .visibility import seen
 
 UNKNOWN = 3000.0
 """Where nothing is said of the noise, a search begins with this part of the focal
 length."""
 
-LEAST = 0.4
-"""Share of the points below which a set of them is not believed without a search."""
-
-
-class Plain(AbstractStage):
-    """All points, in `steps` of least squares from the vertical. Believed if they pass
-    the global test, and every |w| its limit."""
-
-    steps: int = 5
-
-    def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
-        pose = from_vertical(pair, self.steps)
-        return Decision(
-            pose, pair.mask, _untouched(pair, pose, limit), jnp.ones_like(limit)
-        )
-
-
-class Quick(AbstractStage):
-    """The graduated search. Believed if at least `share` of the points are kept, or
-    `many`, these pass the global test, and sets as good are not expected by accident
-    more than `accidents` times. A small part of a regular field of targets may fit a
-    wrong pose. A plane has two poses, and a base that points into a photo several
-    minima, which `Thorough` compares."""
-
-    graduated: GraduatedNonConvexity = GraduatedNonConvexity()
-    share: float = 0.6
-    many: int = 60
-    accidents: float = 1e-4
-
-    def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
-        decision = settled(pair, self.graduated.search(pair), limit)
-        decision = believed_if_it_fits(pair, *decision, limit, LEAST, self.accidents)
-        kept = count(decision.use)
-        enough = (kept >= self.share * count(pair.mask)) | (kept >= self.many)
-        _, _, alone = on_a_plane(pair, decision.pose, decision.use, limit)
-        return decision._replace(
-            believed=decision.believed & enough & ~alone & ~forward(decision.pose)
-        )
-
 
 class Recommended(AbstractProcedure):
-    """The stages in turn, each where the one before was not believed; `no_consensus`
-    where the last is not.
+    """The stages in turn, each for the pairs that the one before did not believe; the
+    outcome is `no_consensus` where the last one does not.
 
     Where another point could be the wrong one as well, the outcome is `undecided`: all
-    these points are named and none of them rejected; the orientation is that without
-    the one that is most likely wrong.
+    these points are named and none of them is rejected; the orientation is the one
+    without the point that is most likely wrong.
 
-    `sigma`: the standard deviation of a coordinate; if None that of the pair. `level`:
-    the probability that a pair without errors loses a point. `known`: whether sigma is
-    known. If not, it is only where the search begins (the focal length / UNKNOWN for a
-    pair whose sigma are all 1, as those that state none), and the points are judged by
-    the noise that is found: sigma0 of the orientation, as a multiple of the sigma of
-    the pair.
+    `sigma`: the standard deviation of a coordinate; if None the one of the pair.
+    `level`: the probability that a pair without errors loses a point. `known`: whether
+    sigma is known. If not, it only says where the search begins (at the focal length /
+    UNKNOWN for a pair whose sigma are all 1, as in pairs that state none), and the
+    points are judged by the noise that is found: sigma0 of the orientation, as a
+    multiple of the sigma of the pair.
     """
 
     sigma: float | None = None
@@ -114,28 +64,33 @@ class Recommended(AbstractProcedure):
     known: bool = True
 
     def __call__(self, pair: Pair) -> Rejection:
-        pair = scaled(mask_unusable(pair)[0], self.sigma)
+        pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
-        begin = jnp.ones_like(pair.focal_left) if self.known else _unit(fixed)
-        fixed = rescaled(fixed, begin)
-        limit = critical_values.by_count(
-            lambda n: critical_values.normal(self.level / jnp.maximum(n, 1.0)),
-            pair.x_left.shape[0],
-            count(pair.mask),
-        )
+        begin = jnp.ones_like(pair.focal_left) if self.known else _first_sigma(fixed)
+        fixed = scale_sigma(fixed, begin)
+        limit = familywise_limit(self.level, pair)
+        pose, use, believed, scale = self._decide(fixed, limit)
+        fixed = scale_sigma(fixed, scale)
+        w = normalised_residuals(linearised(fixed, pose), use)
+        judged = scale_sigma(pair, begin * scale)
+        weighted = fade(judged, pose, use & believed)
+        weighted = scale_sigma(weighted, 1 / (begin * scale))
+        result = verdict(weighted, pose, use, limit, w)
+        result = result.only_if(believed, OUTCOMES.no_consensus)
+        return result.take_back(_in_doubt(fixed, pose, use, believed))
+
+    def _decide(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
+        """The decision of the first stage that is believed, or else of the last."""
         zero = jnp.zeros_like(limit)
-        decision = Decision(vertical(zero), fixed.mask & False, zero > 0, zero + 1)
-        for stage in self.deciding:
-            decision = _where_open(stage, fixed, limit, decision)
-        pose, use, believed, scale = decision
-        fixed = rescaled(fixed, scale)
-        w = normalised(linearised(fixed, pose), use)
-        weighted = faded(rescaled(pair, begin * scale), pose, use & believed)
-        weighted = rescaled(weighted, 1 / (begin * scale))
-        rejection = judged(weighted, pose, use, limit, w).only_if(
-            believed, OUTCOMES.no_consensus
+        decision = Decision(
+            pose=vertical(zero),
+            use=pair.mask & False,
+            believed=zero > 0,
+            scale=zero + 1,
         )
-        return rejection.taking_back(_in_doubt(fixed, pose, use, believed))
+        for stage in self.deciding:
+            decision = _decide_where_open(stage, pair, limit, decision)
+        return decision
 
     @property
     def deciding(self) -> tuple[AbstractStage, ...]:
@@ -158,47 +113,36 @@ class Recommended(AbstractProcedure):
         return [dataclasses.replace(self, stages=stages) for stages in parts if stages]
 
 
+def _decide_where_open(
+    stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision
+) -> Decision:
+    """The decision of a stage where none was believed yet."""
+
+    def decide(is_open: Bool[Array, ""]) -> Decision:
+        own = pair.with_mask(pair.mask & is_open)
+        return stage(mask_unusable(own)[0], limit)
+
+    return if_needed(~before.believed, decide, before)
+
+
 def _in_doubt(
     pair: Pair, pose: RelativePose, use: Use, believed: Bool[Array, ""]
 ) -> Use:
-    """The points of which some are wrong, though nothing tells which; of pairs with few
-    points out."""
+    """The points of which some are wrong, though nothing tells which; only of pairs
+    with few points out."""
     out = pair.mask & ~use
     asked = believed & (count(out) > 0) & (count(out) <= FEW)
 
-    def found(asked):
+    def find(asked: Bool[Array, ""]) -> Use:
         own = pair.with_mask(pair.mask & asked)
-        return undecided(own, pose, use & asked, out & asked & seen(own, pose, 0.0))
+        wrong = out & asked & seen(own, pose, 0.0)
+        return undecided(own, pose, use & asked, wrong)
 
-    return if_needed(asked, found, jnp.zeros_like(use))
+    return if_needed(asked, find, jnp.zeros_like(use))
 
 
-def _unit(pair: Pair) -> Float[Array, ""]:
-    """By what the standard deviations of a pair are to be multiplied where all are 1,
-    as in one that states none."""
+def _first_sigma(pair: Pair) -> Float[Array, ""]:
+    """The factor of the standard deviations with which a search begins that does not
+    know them; 1 for a pair that states any."""
     stated = count(pair.mask & (pair.sigma != 1)) > 0
     return jnp.where(stated, 1.0, pair.focal_left / UNKNOWN)
-
-
-def _untouched(
-    pair: Pair, pose: RelativePose, limit: Float[Array, ""]
-) -> Bool[Array, ""]:
-    """Whether all points agree: the global test, every |w|, and every point in front of
-    both photos."""
-    linear = linearised(pair, pose)
-    within = normalised(linear, pair.mask) <= limit
-    agree = count(pair.mask & within & seen(pair, pose, limit)) == count(pair.mask)
-    misfit = total(jnp.where(pair.mask, linear.squares, 0.0))
-    return agree & (
-        misfit <= evidence.chi_squared_limit(DEVIATIONS, count(pair.mask) - 5)
-    )
-
-
-def _where_open(
-    stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision
-) -> Decision:
-    """The decision of a stage where there is none yet."""
-    decide = lambda open_: stage(
-        mask_unusable(pair.with_mask(pair.mask & open_))[0], limit
-    )
-    return if_needed(~before.believed, decide, before)

@@ -7,18 +7,17 @@ truncated cost
     Σ log(1 + min((r / sigma)², limit²) / FINE²),
 
 first on some of the points, the `judges`, the best on all. Each halving of |r| lowers
-it by about the same amount, down to FINE. So it tells the right orientation also where
-sigma is several times too large and more points agree with another one. A cost that
-grows with r² (MSAC, Torr and Zisserman 2000) does not tell it there. The best of each
-block of subsets is improved on the points near it (Chum, Matas and Kittler 2003) and
-replaces the best so far if it costs less. The search ends when a better orientation, of
+it by about the same amount, down to FINE. So it finds the right orientation also where
+sigma is several times too large and more points agree with another orientation. A cost
+that grows with r² (MSAC, Torr and Zisserman 2000) does not find it there. The best of
+each block of subsets is improved on the points near it (Chum, Matas and Kittler 2003)
+and replaces the best so far if it costs less. The search ends when a better orientation, of
 a larger share p of the points, would have been met with the probability `confidence`:
 after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
 
-Right matches that lie near each other in one photo lie near each other in the other
-one. Every second block therefore draws from the points whose neighbours agree best.
-This changes only the order in which orientations are met: the score knows nothing of
-it, and these blocks do not count for the confidence.
+Of many points every second block draws from the points whose neighbours agree best
+(`neighbours`). This changes only the order in which orientations are met: the cost does
+not depend on it, and these blocks do not count for the confidence.
 """
 
 import math
@@ -32,13 +31,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
-from ..geometry.linear import linearised
 from ..geometry.pairs import Pair
 from ..xla.kernels import while_loop
-from ..xla.passes import count, total
+from ..xla.passes import count
 from . import five_points
-from .hypotheses import moved_up, squares, subsets
-from .robust import seen, stepped
+from .agreement import points_within, squares
+from .hypotheses import Poses, best
+from .masked import choose, sum_of
+from .neighbours import ENOUGH, order_by_neighbours
+from .steps import improve_within, in_single
+from .subsets import choose_places, move_up, move_up_coordinates, subsets_enough
+from .visibility import seen
 
 LUCK = 2.0
 """Subsets of right points alone for one that leads to the right orientation: others are
@@ -48,7 +51,8 @@ FORWARD = 128.0
 """Subsets, at least, where the base points into a photo."""
 
 PER_SUBSET = 2
-"""Orientations that are scored, at most, for each subset on the average of a block."""
+"""Orientations that are compared, at most, for each subset on the average of a
+block."""
 
 GUIDED = 24
 """Blocks of which every second one is drawn from the points whose neighbours agree."""
@@ -60,26 +64,23 @@ FRONTS = 5
 """Halvings of the points to those whose neighbours agree best."""
 
 SMALLEST_FRONT = 12
-NEIGHBOURLY = 40
-"""Points from which their neighbours say something."""
+"""Points that a guided block draws from, at least."""
 
-NEIGHBOURS = 1024
-"""Points that are looked at as neighbours, at most."""
-
-CLOSE = 1.5
-"""Distance of a neighbour in units of the mean distance between points."""
+CLEARLY = 0.5
+"""An orientation lost clearly if fewer than this part of the points agree that agree
+with the best of its block."""
 
 
 class Found(NamedTuple):
-    """The best orientation and its score; blocks of subsets so far, subsets that count,
-    and how many are enough.
+    """The state of a search.
 
-    `agreed` and `asked`: of the orientations that lost clearly, how many points agreed
-    with them, of how many.
+    The best orientation and its cost; blocks of subsets solved, subsets that count for
+    the confidence, and how many are enough. `agreed` and `asked`: of the orientations
+    that lost clearly, how many points agreed with them, and of how many.
     """
 
     pose: RelativePose
-    score: Float[Array, ""]
+    cost: Float[Array, ""]
     blocks: Int[Array, ""]
     counted: Float[Array, ""]
     enough: Float[Array, ""]
@@ -87,12 +88,26 @@ class Found(NamedTuple):
     asked: Float[Array, ""]
 
 
+class Sample(NamedTuple):
+    """The points of a pair for a search: coordinates and sigma of those that take part,
+    before all others; how many they are; and their order by neighbours, if it is
+    used."""
+
+    rows: Float[Array, "point 4"]
+    sigma: Float[Array, "point"]
+    of: Float[Array, ""]
+    order: Int[Array, "point"] | None
+
+
 class Search(eqx.Module):
-    """How to search. `limit`: multiple of sigma up to which a point agrees; `margin`:
-    the factor of it for orientations of five points, which carry the errors of these.
-    `block` subsets are solved together, at most `count`; `judges` points score them
-    first, and the `finalists` best are scored by all points. `steps` of Gauss-Newton
-    improve the best of a block, the first on points within `margin` times the limit."""
+    """How to search.
+
+    `limit`: multiple of sigma up to which a point agrees; `margin`: the factor of it
+    for orientations of five points, which carry the errors of these. `block` subsets
+    are solved together, at most `count`; `judges` points compare their orientations
+    first, and all points compare the `finalists`, the best. `steps` of Gauss-Newton
+    improve the best of a block.
+    """
 
     count: int = 1 << 17
     block: int = 64
@@ -105,14 +120,14 @@ class Search(eqx.Module):
     seed: int = 0
 
     def begin(self, pair: Pair, pose: RelativePose) -> Found:
-        """A search that knows one orientation."""
+        """The state of a search that knows one orientation."""
         zero = jnp.zeros_like(pair.focal_left)
         return Found(
             pose=pose,
-            score=score(pair, pose, self.limit),
+            cost=cost_of(pair, pose, self.limit),
             blocks=zero.astype(int),
             counted=zero,
-            enough=self.enough(pair, pose),
+            enough=self._enough(pair, pose),
             agreed=zero,
             asked=zero,
         )
@@ -120,130 +135,100 @@ class Search(eqx.Module):
     def run(
         self, pair: Pair, found: Found, worth: Float[Array, ""] | float = math.inf
     ) -> Found:
-        """The search, continued until it is enough, or more subsets than it is `worth`
-        have been searched."""
+        """The search, continued until it is enough, or until as many subsets as it is
+        `worth` have been solved."""
         most = -(-self.count // self.block)
-        rows = moved_up(pair)
-        order = (
-            neighbourly(rows, count(pair.mask))
-            if most > 1 and len(rows) >= NEIGHBOURLY
-            else None
-        )
+        sample = _sample(pair, guided=most > 1)
 
         def more(found: Found) -> Bool[Array, ""]:
-            return (found.blocks < most) & (
-                found.counted < jnp.minimum(found.enough, worth)
-            )
+            wanted = jnp.minimum(found.enough, worth)
+            return (found.blocks < most) & (found.counted < wanted)
 
-        return while_loop(
-            more,
-            lambda found: self._searched(pair, rows, order, found),
-            found,
-            pair.focal_left,
-        )
-
-    def enough(self, pair: Pair, pose: RelativePose) -> Float[Array, ""]:
-        """How many subsets are enough, if the share of points that agree with this pose
-        is that of the right ones."""
-        subsets = self.enough_for(
-            count(pair.mask & (squares(pair, pose) <= self.limit**2)), count(pair.mask)
-        )
-        return jnp.where(forward(pose), jnp.maximum(subsets, FORWARD), subsets)
+        step = lambda found: self._search_block(pair, sample, found)
+        return while_loop(more, step, found, pair.focal_left)
 
     def enough_for(
         self, agree: Float[Array, ""], of: Float[Array, ""]
     ) -> Float[Array, ""]:
         """How many subsets are enough to meet the orientation of so many right
         points."""
-        share = math.prod(
-            jnp.maximum(agree - k, 0.0) / jnp.maximum(of - k, 1.0) for k in range(5)
-        )
-        share = jnp.clip(share / LUCK, 1e-12, 1 - 1e-12)
-        return jnp.where(of >= 6, math.log1p(-self.confidence) / jnp.log1p(-share), 0.0)
+        enough = subsets_enough(agree, of, 5, self.confidence, LUCK)
+        return jnp.where(of >= 6, enough, 0.0)
 
-    def _searched(
-        self, pair: Pair, rows: Float[Array, "point 4"], order, found: Found
-    ) -> Found:
-        """After one more block."""
-        of = count(pair.mask)
-        poses, exist = self._hypotheses(pair, rows, order, found.blocks)
-        first = _judged(pair, rows, of, poses, self.judges, self.limit * self.margin)
-        first_score = jnp.where(exist, first.cost, jnp.inf)
-        lost = exist & (first.agree < 0.5 * jnp.max(jnp.where(exist, first.agree, 0.0)))
-        _, chosen = lax.top_k(
-            -first_score.astype(jnp.float32), min(self.finalists, first_score.shape[0])
-        )
-        finalists = jax.tree.map(lambda a: a[chosen], poses)
-        scores = jax.vmap(lambda pose: score(pair, pose, self.limit * self.margin))(
-            finalists
-        )
-        scores = jnp.where(exist[chosen], scores, jnp.inf)
-        best = jax.tree.map(lambda a: a[jnp.argmin(scores)], finalists)
-        new = self._improved(pair, best)
-        new_score = jnp.where(jnp.any(exist), score(pair, new, self.limit), jnp.inf)
-        better = new_score < found.score
-        pose = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, found.pose)
-        counts = jnp.where(self._guided(found.blocks) & (order is not None), 0.0, 1.0)
+    def _enough(self, pair: Pair, pose: RelativePose) -> Float[Array, ""]:
+        """How many subsets are enough, if the share of points that agree with this pose
+        is the share of the right ones."""
+        agree = count(points_within(pair, pose, self.limit))
+        enough = self.enough_for(agree, count(pair.mask))
+        return jnp.where(forward(pose), jnp.maximum(enough, FORWARD), enough)
+
+    def _search_block(self, pair: Pair, sample: Sample, found: Found) -> Found:
+        """The state after one more block of subsets."""
+        wide = self.limit * self.margin
+        poses, exist = self._solve_block(pair, sample, found.blocks)
+        first = _compare(pair, sample, poses, self.judges, wide)
+        new = self._best(pair, poses, exist, first.cost)
+        new = improve_within(pair, new, self.limit, self.margin, self.steps)
+        new_cost = cost_of(pair, new, self.limit)
+        new_cost = jnp.where(jnp.any(exist), new_cost, jnp.inf)
+        better = new_cost < found.cost
+        pose = choose(better, new, found.pose)
+
+        most = jnp.max(jnp.where(exist, first.agree, 0.0))
+        lost = exist & (first.agree < CLEARLY * most)
+        # the five points of a subset agree with its orientations in any case
+        own = 5 * first.asked / jnp.maximum(sample.of, 1.0)
+        guided = self._is_guided(found.blocks) & (sample.order is not None)
         return Found(
             pose=pose,
-            score=jnp.where(better, new_score, found.score),
+            cost=jnp.where(better, new_cost, found.cost),
             blocks=found.blocks + 1,
-            counted=found.counted + counts * self.block,
-            enough=self.enough(pair, pose),
-            agreed=found.agreed
-            + total(
-                jnp.where(
-                    lost, first.agree - 5 * first.asked / jnp.maximum(of, 1.0), 0.0
-                )
-            ),
-            asked=found.asked + total(jnp.where(lost, first.asked, 0.0)),
+            counted=found.counted + jnp.where(guided, 0.0, 1.0) * self.block,
+            enough=self._enough(pair, pose),
+            agreed=found.agreed + sum_of(first.agree - own, lost),
+            asked=found.asked + sum_of(first.asked, lost),
         )
 
-    def _guided(self, block: Int[Array, ""]) -> Bool[Array, ""]:
+    def _best(
+        self,
+        pair: Pair,
+        poses: RelativePose,
+        exist: Bool[Array, "hypothesis"],
+        first: Float[Array, "hypothesis"],
+    ) -> RelativePose:
+        """The best of a block by all points, of the finalists by their `first` cost."""
+        first = jnp.where(exist, first, jnp.inf).astype(jnp.float32)
+        finalists = min(self.finalists, len(first))
+        _, chosen = lax.top_k(-first, finalists)
+        finalists = jax.tree.map(lambda a: a[chosen], poses)
+        wide = self.limit * self.margin
+        costs = jax.vmap(lambda pose: cost_of(pair, pose, wide))(finalists)
+        return best(finalists, jnp.where(exist[chosen], costs, jnp.inf))
+
+    def _is_guided(self, block: Int[Array, ""]) -> Bool[Array, ""]:
         return (block < GUIDED) & (block % 2 == 1)
 
-    def _hypotheses(
-        self, pair: Pair, rows, order, block
-    ) -> tuple[RelativePose, Bool[Array, "hypothesis"]]:
+    def _solve_block(self, pair: Pair, sample: Sample, block: Int[Array, ""]) -> Poses:
         """The orientations of a block of subsets."""
-        of = count(pair.mask)
-        uniform = jax.random.uniform(
-            jax.random.fold_in(jax.random.key(self.seed), block),
-            (5, self.block),
-            jnp.float32,
-        )
+        key = jax.random.fold_in(jax.random.key(self.seed), block)
+        uniform = jax.random.uniform(key, (5, self.block), jnp.float32)
+        of, order = sample.of, sample.order
         if order is None:
-            places = subsets(uniform, of)
+            places = choose_places(uniform, of)
         else:
+            halvings = 1 + (block // 2) % FRONTS
             front = jnp.maximum(
-                of * 0.5 ** (1 + (block // 2) % FRONTS).astype(of.dtype),
-                float(SMALLEST_FRONT),
+                of * 0.5 ** halvings.astype(of.dtype), float(SMALLEST_FRONT)
             )
-            guided = self._guided(block)
-            places = subsets(
-                uniform, jnp.where(guided, jnp.minimum(jnp.ceil(front), of), of)
-            )
-            places = jnp.where(
-                guided, order.at[places].get(mode="clip").astype(places.dtype), places
-            )
-        few = rows.at[places].get(mode="clip")
-        x1, y1, x2, y2 = (few[..., k] for k in range(4))
-        minus = -jnp.ones_like(x1)
-        left = jnp.stack([x1 / pair.focal_left, y1 / pair.focal_left, minus], axis=1)
-        right = jnp.stack([x2 / pair.focal_right, y2 / pair.focal_right, minus], axis=1)
-        return _gathered(five_points.solve(left, right), PER_SUBSET * self.block)
-
-    def _improved(self, pair: Pair, pose: RelativePose) -> RelativePose:
-        """Gauss-Newton on the points within a limit that narrows."""
-
-        def step(k, pose):
-            wide = self.limit * jnp.where(k < self.steps - 1, self.margin, 1.0)
-            linear = linearised(pair, pose)
-            return stepped(
-                pose, linear, jnp.where(linear.squares <= wide**2, linear.weight, 0.0)
-            )
-
-        return lax.fori_loop(0, self.steps, step, pose)
+            front = jnp.minimum(jnp.ceil(front), of)
+            guided = self._is_guided(block)
+            places = choose_places(uniform, jnp.where(guided, front, of))
+            in_order = order.at[places].get(mode="clip").astype(places.dtype)
+            places = jnp.where(guided, in_order, places)
+        few = sample.rows.at[places].get(mode="clip")
+        left = _vectors(few[..., 0], few[..., 1], pair.focal_left)
+        right = _vectors(few[..., 2], few[..., 3], pair.focal_right)
+        return _gather(five_points.solve(left, right), PER_SUBSET * self.block)
 
 
 def forward(pose: RelativePose) -> Bool[Array, ""]:
@@ -258,119 +243,116 @@ def forward(pose: RelativePose) -> Bool[Array, ""]:
     return z**2 > x**2 + y**2
 
 
-class Judgement(NamedTuple):
-    """Of each orientation the truncated cost of some points, how many of them agree,
-    and of how many."""
+def cost_of(pair: Pair, pose: RelativePose, limit: float) -> Float[Array, ""]:
+    """The cost of all points, the most for one that cannot be seen from there; infinite
+    where it is no number."""
+    visible = seen(pair, pose, limit)
+    square = jnp.where(visible, squares(pair, pose), limit**2)
+    value = sum_of(_point_cost(square, limit), pair.mask)
+    return jnp.where(jnp.isfinite(value), value, jnp.inf)
+
+
+def _point_cost(
+    square: Float[Array, "*points"], limit: float
+) -> Float[Array, "*points"]:
+    """log(1 + min((r / sigma)², limit²) / FINE²) of (r / sigma)²."""
+    cut = jnp.minimum(square, limit**2)
+    return jnp.log1p(cut / FINE**2)
+
+
+def _sample(pair: Pair, guided: bool) -> Sample:
+    """The points of a pair for a search of blocks that are `guided` by neighbours, if
+    there are ENOUGH of them."""
+    rows, of = move_up_coordinates(pair), count(pair.mask)
+    order = None
+    if guided and len(rows) >= ENOUGH:
+        order = order_by_neighbours(rows, of)
+    return Sample(
+        rows=rows, sigma=move_up(pair, pair.sigma, fill=1.0), of=of, order=order
+    )
+
+
+def _vectors(
+    x: Float[Array, "5 subset"], y: Float[Array, "5 subset"], focal: Float[Array, ""]
+) -> Float[Array, "5 3 subset"]:
+    """The image vectors (x/f, y/f, -1)."""
+    minus = -jnp.ones_like(x)
+    return jnp.stack([x / focal, y / focal, minus], axis=1)
+
+
+def _gather(solutions: five_points.Solutions, most: int) -> Poses:
+    """The solutions that exist, one behind the other on `most` places, as poses."""
+    exist = solutions.exist.reshape(-1)
+    reached = jnp.cumsum(exist.astype(int))
+    place = jnp.where(exist, reached - 1, most)
+    index = jnp.arange(len(exist))
+    source = jnp.zeros(most, int).at[place].set(index, mode="drop")
+
+    def gather(a):
+        flat = a.reshape(*a.shape[:-2], -1)
+        return flat[..., source]
+
+    rotation = gather(jnp.moveaxis(solutions.rotation, 0, 2))
+    base = gather(jnp.moveaxis(solutions.base, 0, 1))
+    pose = jax.vmap(_pose, (2, 1))(rotation, base)
+    there = jnp.arange(most) < reached[-1]
+    finite = jnp.isfinite(sum(jax.tree.leaves(pose)))
+    fine = there & finite
+    one = jnp.ones_like(pose.qw)
+    pose = jax.tree.map(lambda a: jnp.where(fine, a, one), pose)
+    return jax.vmap(RelativePose.normalise)(pose), fine
+
+
+def _pose(rotation: Float[Array, "3 3"], base: Float[Array, "3"]) -> RelativePose:
+    quaternion = rot.to_quaternion(rot.as_matrix(rotation))
+    return RelativePose(*quaternion, base[0], base[1], base[2])
+
+
+class Comparison(NamedTuple):
+    """Of each orientation the cost of some points, how many of them agree, and of how
+    many."""
 
     cost: Float[Array, "hypothesis"]
     agree: Float[Array, "hypothesis"]
     asked: Float[Array, "hypothesis"]
 
 
-def _gathered(
-    solutions: five_points.Solutions, most: int
-) -> tuple[RelativePose, Bool[Array, "hypothesis"]]:
-    """The solutions that exist, one behind the other on `most` places, as poses."""
-    exist = solutions.exist.reshape(-1)
-    place = jnp.where(exist, jnp.cumsum(exist.astype(int)) - 1, most)
-    source = jnp.zeros(most, int).at[place].set(jnp.arange(exist.shape[0]), mode="drop")
-    flat = lambda a: a.reshape(*a.shape[:-2], -1)
-    rotation = flat(jnp.moveaxis(solutions.rotation, 0, 2))
-    base = flat(jnp.moveaxis(solutions.base, 0, 1))
-    rotation, base = rotation[:, :, source], base[:, source]
-    pose = jax.vmap(_pose, (2, 1))(rotation, base)
-    there = jnp.arange(most) < jnp.sum(exist.astype(int))
-    fine = there & jnp.isfinite(sum(jax.tree.leaves(pose)))
-    one = jnp.ones_like(pose.qw)
-    pose = jax.tree.map(lambda a: jnp.where(fine, a, one), pose)
-    return jax.vmap(lambda pose: pose.normalise())(pose), fine
-
-
-def _pose(rotation: Float[Array, "3 3"], base: Float[Array, "3"]) -> RelativePose:
-    return RelativePose(
-        *rot.to_quaternion(rot.as_matrix(rotation)), base[0], base[1], base[2]
-    )
-
-
-def _judged(
-    pair: Pair, rows, of, poses: RelativePose, judges: int, limit: float
-) -> Judgement:
-    """What points evenly taken of all say of every orientation, in single precision."""
-    size = min(judges, rows.shape[0])
-    number = jnp.arange(size)
-    place = jnp.where(
-        of > size, jnp.floor(number.astype(of.dtype) * (of / size)).astype(int), number
-    )
-    there = (number.astype(of.dtype) < of).astype(jnp.float32)[:, None]
-    single = lambda a: a.astype(jnp.float32)
-    points = single(rows.at[place].get(mode="clip"))
-    sigma = moved_up_sigma(pair).at[place].get(mode="clip")
-    bound = single((limit * sigma) ** 2)[:, None]
+def _compare(
+    pair: Pair, sample: Sample, poses: RelativePose, judges: int, limit: float
+) -> Comparison:
+    """The cost of every orientation for points evenly taken of all, in single
+    precision."""
+    points, sigma, there = _judges(sample, judges)
+    bound = ((limit * sigma) ** 2).astype(jnp.float32)[:, None]
     fundamental = lambda pose: coplanarity.fundamental_matrix(
         *pose.relative(), pair.focal_left, pair.focal_right
     )
-    f = jax.tree.map(single, jax.vmap(fundamental)(poses))
-
-    def one(f, point, use):
-        g, square, _ = coplanarity.linearise(f, point, use)
-        return g * g / square
-
-    each = jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, 0))
-    r2 = each(f, tuple(points[:, k] for k in range(4)), there[:, 0] > 0)
-    costs = cost(r2 / bound * limit**2, limit)
-    agree = jnp.where(r2 <= bound, there, 0.0)
+    matrices = in_single(jax.vmap(fundamental)(poses))
+    of_poses = jax.vmap(_square, (0, None, None))
+    r2 = jax.vmap(of_poses, (None, 0, 0))(matrices, points, there > 0)
+    weight = there[:, None]
+    costs = _point_cost(r2 / bound * limit**2, limit)
+    cost = jnp.sum(costs * weight, axis=0)
+    agree = jnp.sum(jnp.where(r2 <= bound, weight, 0.0), axis=0)
+    asked = jnp.broadcast_to(jnp.sum(there), cost.shape)
     double = lambda a: a.astype(pair.focal_left.dtype)
-    asked = jnp.broadcast_to(jnp.sum(there), costs.shape[1:])
-    return Judgement(
-        *map(double, (jnp.sum(costs * there, axis=0), jnp.sum(agree, axis=0), asked))
-    )
+    return Comparison(cost=double(cost), agree=double(agree), asked=double(asked))
 
 
-def neighbourly(
-    rows: Float[Array, "point 4"], of: Float[Array, ""]
-) -> Int[Array, "point"]:
-    """The places of the points, first those whose neighbours in the left photo are
-    neighbours in the right one, too."""
-    size = rows.shape[0]
-    single = rows.astype(jnp.float32)
-    there = (jnp.arange(size, dtype=of.dtype) < of).astype(jnp.float32)
-    step = -(-size // NEIGHBOURS)
-    others, taken = single[::step], there[::step]
-
-    def spread(x, y):
-        mean = lambda a: jnp.sum(a * there) / jnp.maximum(jnp.sum(there), 1.0)
-        variance = mean(x * x) - mean(x) ** 2 + mean(y * y) - mean(y) ** 2
-        return jnp.maximum(variance, 1e-12) * 4 / jnp.maximum(jnp.sum(taken), 1.0)
-
-    near_left, near_right = (
-        CLOSE**2 * spread(single[:, k], single[:, k + 1]) for k in (0, 2)
-    )
-
-    def agreement(row):
-        left = (others[:, 0] - row[0]) ** 2 + (others[:, 1] - row[1]) ** 2
-        right = (others[:, 2] - row[2]) ** 2 + (others[:, 3] - row[3]) ** 2
-        near = taken / (1 + left / near_left) ** 2
-        both = near / (1 + right / near_right) ** 2
-        return jnp.sum(both) / jnp.maximum(jnp.sum(near), 1e-6)
-
-    value = jnp.where(there > 0, jax.vmap(agreement)(single), -1.0)
-    return jnp.argsort(-value)
+def _square(f: tuple, point: Float[Array, "4"], use: Bool[Array, ""]) -> Array:
+    """r² of a point under the fundamental matrix F."""
+    g, variance, _ = coplanarity.linearise(f, tuple(point), use)
+    return g * g / variance
 
 
-def moved_up_sigma(pair: Pair) -> Float[Array, "point"]:
-    """The standard deviations of the points that take part, moved before all others."""
-    place = jnp.where(pair.mask, jnp.cumsum(pair.mask) - 1, pair.mask.shape[0])
-    return jnp.ones_like(pair.sigma).at[place].set(pair.sigma, mode="drop")
-
-
-def score(pair: Pair, pose: RelativePose, limit: float) -> Float[Array, ""]:
-    """The cost of all points, the most of one that cannot be seen from there; infinite
-    where it is no number."""
-    found = jnp.where(seen(pair, pose, limit), squares(pair, pose), limit**2)
-    value = total(jnp.where(pair.mask, cost(found, limit), 0.0))
-    return jnp.where(jnp.isfinite(value), value, jnp.inf)
-
-
-def cost(square: Float[Array, "*points"], limit: float) -> Float[Array, "*points"]:
-    """log(1 + min((r / sigma)², limit²) / FINE²) of (r / sigma)²."""
-    return jnp.log1p(jnp.minimum(square, limit**2) / FINE**2)
+def _judges(sample: Sample, judges: int) -> tuple[Array, Array, Array]:
+    """Coordinates and sigma of points evenly taken of all, and 1 for those that
+    exist."""
+    size = min(judges, sample.rows.shape[0])
+    number = jnp.arange(size)
+    exact = number.astype(sample.of.dtype)
+    spread = jnp.floor(exact * (sample.of / size)).astype(int)
+    place = jnp.where(sample.of > size, spread, number)
+    points = in_single(sample.rows.at[place].get(mode="clip"))
+    sigma = sample.sigma.at[place].get(mode="clip")
+    return points, sigma, (exact < sample.of).astype(jnp.float32)

@@ -1,36 +1,38 @@
-"""The search for pairs that nothing quicker decides: hypotheses in any position, and
-the evidence for the best."""
+"""The last stage of `recommended`: a search in any position, and the evidence for what
+it finds."""
 
 import math
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation import planes
 from ..xla.kernels import if_needed, while_loop
-from ..xla.passes import count, total
+from ..xla.passes import count
 from . import evidence
+from .agreement import points_within, squares
 from .graduated_non_convexity import GraduatedNonConvexity
-from .hypotheses import Newton, squares
+from .hypotheses import Newton
+from .masked import Use, choose, sum_of
 from .noise import noise_of
 from .ransac import Ransac
-from .robust import reweighted
-from .search import Found, Search, score
+from .search import Found, Search, cost_of
 from .stages import (
-    DEVIATIONS,
     AbstractStage,
     Decision,
-    Use,
-    believed_if_it_fits,
-    from_vertical,
+    believe_if_it_fits,
     on_a_plane,
-    rescaled,
-    settled,
+    scale_sigma,
+    settle,
 )
+from .steps import from_vertical, geman_mcclure, step_by_weights
+
+STEPS = 8
+"""Steps of least squares from the vertical."""
 
 OVERWHELMING = math.log(1e-9)
 """Logarithm of an expected number of accidents at which a search that came to its end
@@ -45,11 +47,11 @@ TURNS = 2
 """Searches, the second one with the noise that the first one found."""
 
 APART = 0.6
-"""Ratio of the noise found to that taken, or of that taken to that found, below which a
-search begins again."""
+"""Ratio of the noise found to the noise assumed, or of the assumed to the found one,
+below which a search begins again."""
 
 MAJORITY = 0.4
-"""Part of the points that agreed before that the noise has to be that of: a few points
+"""Part of the points that agreed before that the noise has to come from: a few points
 may agree by accident."""
 
 SURE = 30.0
@@ -57,30 +59,42 @@ SURE = 30.0
 points some fit by accident."""
 
 NARROWER, NARROWINGS = 0.7, 12
-"""By how much the limit narrows in two steps, and how many steps: down to an eighth."""
+"""The factor by which the limit narrows in two steps, and the number of steps: down to
+an eighth."""
 
 MOST = 20.0
-"""How many times larger or smaller than that taken at first the noise may be."""
+"""How many times larger or smaller than the stated noise the noise found may be."""
+
+
+class Turn(NamedTuple):
+    """The state between two searches: how many there were, whether another one is
+    needed, the noise to judge by as a multiple of the stated one, and the search."""
+
+    number: Int[Array, ""]
+    again: Bool[Array, ""]
+    scale: Float[Array, ""]
+    found: Found
 
 
 class Thorough(AbstractStage):
     """Random subsets in any position until a better orientation would have been met,
     and the evidence for what is found.
 
-    It begins with the best of all points from the vertical, the graduated search, and
-    for at most `few` points many subsets solved from the vertical: of few points that
-    finds what a search in any position takes long for. What is found is believed if it
-    fits as `Quick` asks, with `accidents_at_once`; or if the subsets were enough to
-    have met a set of `better` times as many points, and sets as good are not expected
-    by accident more than `accidents` times (of many points more seldom), by the chance
-    of agreement that partners shifted among the points and the orientations that lost
-    have on this scene. Points that repeat others count once. Of a plane with other
+    The search begins with the best of all points from the vertical, the graduated
+    search, and for at most `few` points many subsets solved from the vertical, which
+    for few points is quicker than a search in any position. What is found is believed
+    if `believe_if_it_fits`, with at least `share` of the points and
+    `accidents_at_once`. Else it is believed if the subsets were enough to have met a
+    set of `better` times as many points, and sets as good are not expected by accident
+    more than `accidents` times (for many points more seldom). The chance of agreement
+    is measured on this scene: by partners shifted among the points, and by the
+    orientations that lost. Points that repeat others count once. Of a plane with other
     points beside it both poses are compared. The search ends when no set that it could
     still find would be believed, after at least `least` subsets, so that the pose is as
     good as it can be where nothing is believed.
 
     Where the residuals leave no doubt that sigma is much too large, the search begins
-    again with the noise that they show, by which the points are then judged, too; where
+    again with the noise that they show, and the points are then judged by it. Where
     sigma is not `known` they always are.
     """
 
@@ -98,70 +112,94 @@ class Thorough(AbstractStage):
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         again, key = evidence.repeats(pair)
         once = mask_unusable(pair.with_mask(pair.mask & ~again))[0]
-        found, scale = self._searched(once, self._near_vertical(once), limit)
-        once = rescaled(once, scale)
-        pose, use = _of_both_poses(once, *settled(once, found.pose, limit), limit)
-
-        chance = jnp.maximum(
-            _chance(once, pose, use, limit),
-            found.agreed / jnp.maximum(found.asked, 1.0),
-        )
-        of = count(once.mask)
-        expected = evidence.least_accidents(squares(once, pose), use, chance, of, limit)
-        enough = self.search.enough_for(jnp.minimum(self.better * count(use), of), of)
-        thorough = (found.counted >= enough) | (expected <= OVERWHELMING)
-        certain = (expected <= self._most(of)) & thorough
-        at_once = (
-            believed_if_it_fits(
-                once, pose, use, limit, self.share, self.accidents_at_once
-            ).believed
-            & self.known
+        found, scale = self._search(once, self._near_vertical(once), limit)
+        once = scale_sigma(once, scale)
+        pose, use = settle(once, found.pose, limit)
+        pose, use = _better_of_both_poses(once, pose, use, limit)
+        at_once = self.known & believe_if_it_fits(
+            once, pose, use, limit, self.share, self.accidents_at_once
         )
         return Decision(
-            pose, evidence.with_repeats(use, again, key), certain | at_once, scale
+            pose=pose,
+            use=evidence.with_repeats(use, again, key),
+            believed=at_once | self._is_certain(once, pose, use, found, limit),
+            scale=scale,
         )
 
-    def _searched(
+    def _is_certain(
+        self,
+        pair: Pair,
+        pose: RelativePose,
+        use: Use,
+        found: Found,
+        limit: Float[Array, ""],
+    ) -> Bool[Array, ""]:
+        """Whether the search was thorough enough, and the points in use are no
+        accident."""
+        of = count(pair.mask)
+        chance = _chance(pair, pose, use, limit)
+        by_losers = found.agreed / jnp.maximum(found.asked, 1.0)
+        chance = jnp.maximum(chance, by_losers)
+        s = squares(pair, pose)
+        accidents = evidence.log_least_accidents(s, use, chance, of, limit)
+        better = jnp.minimum(self.better * count(use), of)
+        met = found.counted >= self.search.enough_for(better, of)
+        thorough = met | (accidents <= OVERWHELMING)
+        return (accidents <= self._most_accidents(of)) & thorough
+
+    def _search(
         self, pair: Pair, first: RelativePose, limit: Float[Array, ""]
     ) -> tuple[Found, Float[Array, ""]]:
-        """The search from a first pose, and the noise to judge by, as a multiple of
-        that stated."""
+        """The search from a first pose, and the noise to judge by, as a multiple of the
+        stated one."""
 
-        def turn(state):
-            k, _, scale, found = state
-            own = rescaled(pair, scale)
-            found = self.search.run(
-                own,
-                self.search.begin(own, found.pose),
-                self._worth(own, found.pose, limit),
+        def turn(state: Turn) -> Turn:
+            scale = state.scale
+            own = scale_sigma(pair, scale)
+            begin = self.search.begin(own, state.found.pose)
+            worth = self._worth(own, state.found.pose, limit)
+            found = self.search.run(own, begin, worth)
+            narrowed = _narrow(own, found.pose, self.search.limit)
+            new = self._new_scale(pair, own, scale, found.pose, narrowed)
+            again = (new < APART * scale) | (scale < APART * new)
+            pose = choose(again, narrowed, found.pose)
+            return Turn(
+                number=state.number + 1,
+                again=again,
+                scale=new,
+                found=found._replace(pose=pose),
             )
-            narrowed = _narrowed(own, found.pose, self.search.limit)
-            noise = noise_of(squares(pair, narrowed), pair.mask)
-            upper = noise.sigma * (
-                1 + DEVIATIONS / jnp.sqrt(2 * jnp.maximum(noise.redundancy, 0.5))
-            )
-            agreed = count(squares(own, found.pose) <= self.search.limit**2)
-            of_most = noise.redundancy >= MAJORITY * agreed
-            too_large = (upper < APART * scale) & (noise.redundancy >= SURE)
-            taken = noise.known & of_most & (too_large | (not self.known))
-            new = jnp.where(taken, jnp.clip(noise.sigma, 1 / MOST, MOST), scale)
-            apart = (new < APART * scale) | (scale < APART * new)
-            pose = jax.tree.map(
-                lambda a, b: jnp.where(apart, a, b), narrowed, found.pose
-            )
-            return k + 1, apart, new, found._replace(pose=pose)
 
-        one = jnp.ones_like(limit)
-        start = (
-            jnp.zeros((), int),
-            count(pair.mask) > 0,
-            one,
-            self.search.begin(pair, first),
+        start = Turn(
+            number=jnp.zeros((), int),
+            again=count(pair.mask) > 0,
+            scale=jnp.ones_like(limit),
+            found=self.search.begin(pair, first),
         )
-        _, _, scale, found = while_loop(
-            lambda state: state[1] & (state[0] < TURNS), turn, start, pair.focal_left
-        )
-        return found, scale
+        more = lambda state: state.again & (state.number < TURNS)
+        end = while_loop(more, turn, start, pair.focal_left)
+        return end.found, end.scale
+
+    def _new_scale(
+        self,
+        pair: Pair,
+        own: Pair,
+        scale: Float[Array, ""],
+        pose: RelativePose,
+        narrowed: RelativePose,
+    ) -> Float[Array, ""]:
+        """The noise that the residuals show, as a multiple of the stated one, if it is
+        to be taken in place of the assumed `scale`; `own`: the pair with the assumed
+        noise."""
+        noise = noise_of(squares(pair, narrowed), pair.mask)
+        redundancy = noise.redundancy
+        relative = 1 / jnp.sqrt(2 * jnp.maximum(redundancy, 0.5))
+        upper = noise.sigma * (1 + evidence.DEVIATIONS * relative)
+        too_large = (upper < APART * scale) & (redundancy >= SURE)
+        agreed = count(squares(own, pose) <= self.search.limit**2)
+        of_most = redundancy >= MAJORITY * agreed
+        taken = noise.known & of_most & (too_large | (not self.known))
+        return jnp.where(taken, jnp.clip(noise.sigma, 1 / MOST, MOST), scale)
 
     def _worth(
         self, pair: Pair, pose: RelativePose, limit: Float[Array, ""]
@@ -169,30 +207,26 @@ class Thorough(AbstractStage):
         """How many subsets are worth it: enough to meet the smallest set that would be
         believed."""
         of = count(pair.mask)
-        use = pair.mask & (squares(pair, pose) <= limit**2)
-        fewest = evidence.fewest(
-            _chance(pair, pose, use, limit), of, self._most(of), pair.mask.shape[0]
-        )
+        use = points_within(pair, pose, limit)
+        chance = _chance(pair, pose, use, limit)
+        most = self._most_accidents(of)
+        fewest = evidence.fewest_points(chance, of, most, pair.mask.shape[0])
         return jnp.maximum(self.search.enough_for(fewest, of), float(self.least))
 
-    def _most(self, of: Float[Array, ""]) -> Float[Array, ""]:
+    def _most_accidents(self, of: Float[Array, ""]) -> Float[Array, ""]:
         """Logarithm of the expected number of accidents up to which a set of so many
         points is believed."""
         return math.log(self.accidents) * jnp.maximum(of / PLENTY, 1.0)
 
     def _near_vertical(self, pair: Pair) -> RelativePose:
         """The best orientation of those that begin at the vertical."""
-        small = mask_unusable(
-            pair.with_mask(pair.mask & (count(pair.mask) <= self.few))
-        )[0]
-        best = from_vertical(pair, 8)
+        few = count(pair.mask) <= self.few
+        small = mask_unusable(pair.with_mask(pair.mask & few))[0]
+        best = from_vertical(pair, STEPS)
+        limit = self.search.limit
         for other in (self.graduated.search(pair), self.near.search(small)):
-            better = score(pair, other, self.search.limit) < score(
-                pair, best, self.search.limit
-            )
-            best = jax.tree.map(
-                lambda a, b, better=better: jnp.where(better, a, b), other, best
-            )
+            better = cost_of(pair, other, limit) < cost_of(pair, best, limit)
+            best = choose(better, other, best)
         return best
 
 
@@ -201,44 +235,42 @@ def _chance(
 ) -> Float[Array, ""]:
     """The chance that a wrong point agrees with a pose."""
     agreed, asked = evidence.shifted_agreement(pair, pose, limit)
-    spread = evidence.scattered(squares(pair, pose), pair.mask & ~use, limit) / 2
+    out = pair.mask & ~use
+    spread = evidence.chance_by_distance(squares(pair, pose), out, limit) / 2
     return jnp.maximum((agreed + 1) / (asked + 2), spread)
 
 
-def _of_both_poses(
+def _better_of_both_poses(
     pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]
 ) -> tuple[RelativePose, Use]:
-    """Where the points in use are those of a plane, and others are out, the one of its
-    two poses that costs less."""
-    facing, plane, alone = on_a_plane(pair, pose, use, limit)
+    """The pose and its points; if they are those of a plane, and others are out, the
+    one of the plane's two poses that costs less."""
+    facing, plane, flat = on_a_plane(pair, pose, use, limit)
 
-    def cost(pose, use):
-        return total(
-            jnp.where(pair.mask, jnp.where(use, squares(pair, pose), limit**2), 0.0)
-        )
+    def cost(pose: RelativePose, use: Use) -> Float[Array, ""]:
+        each = jnp.where(use, squares(pair, pose), limit**2)
+        return sum_of(each, pair.mask)
 
-    def chosen(needed):
+    def compare(needed: Bool[Array, ""]) -> tuple[RelativePose, Use]:
         own = pair.with_mask(pair.mask & needed)
-        other, exists = planes.second(
-            own.with_mask(plane.within & needed), facing, plane.normal
-        )
-        other, others = settled(own, other, limit)
+        in_plane = own.with_mask(plane.within & needed)
+        other, exists = planes.second(in_plane, facing, plane.normal)
+        other, others = settle(own, other, limit)
         better = exists & (cost(other, others) < cost(pose, use))
-        return jax.tree.map(
-            lambda a, b: jnp.where(better, a, b), (other, others), (pose, use)
-        )
+        return choose(better, (other, others), (pose, use))
 
-    return if_needed(alone, chosen, (pose, use))
+    return if_needed(flat, compare, (pose, use))
 
 
-def _narrowed(pair: Pair, pose: RelativePose, limit: float) -> RelativePose:
+def _narrow(pair: Pair, pose: RelativePose, limit: float) -> RelativePose:
     """The pose that the points near it lead to, as the limit within which they count
-    narrows (graduated weights of Geman and McClure): where sigma is too large, wrong
-    points within the limit hide the right pose from a search."""
+    narrows (weights of Geman and McClure): where sigma is too large, wrong points
+    within the limit hide the right pose from a search."""
 
-    def step(k, pose):
+    def step(pose, k):
         width = limit * NARROWER ** (k / 2)
-        return reweighted(pair, pose, lambda s: 1 / (1 + s / width**2) ** 2)
+        weight = lambda s: geman_mcclure(s, width**2)
+        return step_by_weights(pair, pose, weight), None
 
     steps = jnp.arange(NARROWINGS, dtype=pair.focal_left.dtype)
-    return lax.scan(lambda pose, k: (step(k, pose), None), pose, steps)[0]
+    return lax.scan(step, pose, steps)[0]

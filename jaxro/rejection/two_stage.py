@@ -1,20 +1,21 @@
-"""One procedure after another."""
+"""Two procedures, one after the other."""
 
+import jax
 import jax.numpy as jnp
 
 from ..geometry.pairs import Pair
-from .base import OUTCOMES, AbstractProcedure, Log, Rejection
+from .base import OUTCOMES, AbstractProcedure, Rejection
 from .dorozhinsky import Dorozhinsky
 from .leave_one_out_grubbs import LeaveOneOutGrubbs
 
 
 class TwoStage(AbstractProcedure):
-    """Residual parallaxes first, Grubbs on the points left: the two stages of table 2
-    of 1989.
+    """Residual parallaxes first, then Grubbs' test on the points left: the two stages
+    of table 2 of Burshtynskaya and Tumskaya (1989).
 
-    Its residual-parallax stage (eqs 2 to 4) is the algorithm of 1971. Any two
-    procedures can be chained. A pair on which the first needs an operator is still
-    given to the second, and keeps that outcome.
+    Their residual-parallax stage (eqs 2 to 4) is the algorithm of 1971. Any two
+    procedures can be chained. A pair for which the first one needs an operator goes
+    through the second as well, and keeps that outcome.
     """
 
     first: AbstractProcedure = Dorozhinsky()
@@ -23,31 +24,14 @@ class TwoStage(AbstractProcedure):
     def __call__(self, pair: Pair) -> Rejection:
         one = self.first(pair)
         two = self.second(pair.with_mask(one.mask))
-        later = two.order > 0
-        log = Log(
-            *(
-                jnp.concatenate([a, b])
-                for a, b in zip(_parts(one.log), _parts(two.log), strict=True)
-            )
-        )
+        early, late = one.order > 0, two.order > 0
         unfinished = one.outcome == OUTCOMES.operator_needed
         return Rejection(
             mask=two.mask,
-            order=jnp.where(later, two.order + jnp.max(one.order), one.order),
-            statistic=jnp.where(one.order > 0, one.statistic, two.statistic),
-            log=log,
+            order=jnp.where(late, two.order + jnp.max(one.order), one.order),
+            statistic=jnp.where(early, one.statistic, two.statistic),
+            log=jax.tree.map(lambda *both: jnp.concatenate(both), one.log, two.log),
             orientation=two.orientation,
             outcome=OUTCOMES.where(unfinished, one.outcome, two.outcome),
             undecided=two.undecided,
         )
-
-
-def _parts(log: Log) -> tuple:
-    return (
-        log.happened,
-        log.statistic,
-        log.limit,
-        log.rejected,
-        log.parallax,
-        log.elements,
-    )

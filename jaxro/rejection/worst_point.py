@@ -1,23 +1,19 @@
-"""The third algorithm of 1971: the largest residual parallax goes, and all begins
-again."""
+"""The third algorithm of 1971: reject the largest residual parallax, and begin again."""
 
 import jax.numpy as jnp
 
 from ..geometry.pairs import Pair, mask_unusable
 from ..xla.passes import count
-from .base import (
-    OUTCOMES,
-    AbstractProcedure,
-    Rejection,
+from .base import AbstractProcedure, Rejection
+from .masked import mean_of
+from .parallaxes import adjust_parallaxes
+from .rounds import (
     Round,
-    began,
-    by_parallax,
-    ended,
-    finished,
+    conclude,
+    element_values,
+    finished_if,
     largest,
-    mean_of,
-    repeated,
-    values,
+    repeat_rounds,
 )
 
 
@@ -37,27 +33,22 @@ class WorstPoint(AbstractProcedure):
         pair = mask_unusable(pair)[0]
         enough = pair.count > self.more_than
 
-        def judge(mask, history):
-            # from zero in every round: a start that earlier points have spoiled gains
-            # nothing
-            solved = by_parallax(pair, mask)
+        def judge(mask):
+            # every round begins with zero elements: the last solution is spoiled by the
+            # point that was rejected
+            solved = adjust_parallaxes(pair, mask)
             q = jnp.abs(solved.parallax)
-            excess = q - mean_of(q, mask)
-            go_on = (
-                (count(mask & (excess >= self.eps)) > 0)
-                & (count(mask) > self.least)
-                & enough
-            )
+            mean = mean_of(q, mask)
+            wrong = mask & (q - mean >= self.eps)
+            go_on = (count(wrong) > 0) & (count(mask) > self.least) & enough
             return Round(
-                q,
-                self.eps + mean_of(q, mask),
-                largest(q, mask) & go_on,
-                solved.parallax,
-                values(solved.elements),
+                statistic=q,
+                limit=self.eps + mean,
+                rejected=largest(q, mask) & go_on,
+                parallax=solved.parallax,
+                elements=element_values(solved.elements),
             )
 
-        history = repeated(
-            judge, began(pair, max(pair.x_left.shape[0] - self.least, 0) + 1)
-        )
-        outcome = OUTCOMES.where(enough, finished(pair), OUTCOMES.nothing_to_test)
-        return ended(history, by_parallax(pair, history.mask), outcome)
+        history = repeat_rounds(judge, pair, self.least)
+        final = adjust_parallaxes(pair, history.mask)
+        return conclude(history, final, finished_if(enough))

@@ -13,7 +13,7 @@ import jaxro
 from jaxro import IndependentElements
 from jaxro.assessment import correlations, familywise, identification
 from jaxro.assessment.undecided import undecided
-from jaxro.experiments.compare import Setting, simulated
+from jaxro.experiments.compare import Setting, simulate
 from jaxro.geometry import mock_pairs
 from jaxro.geometry.linear import linearised
 from jaxro.rejection import OUTCOMES, DataSnooping
@@ -161,7 +161,7 @@ def rejection(found):
 def cleaned(points, size, trials, procedure=SNOOPING, layout=layout):
     """What was rejected, undecided and wrong in pairs with one error of this size in
     the right-hand y."""
-    pairs, wrong = simulated(
+    pairs, wrong = simulate(
         exact(points, layout), Setting(f"{points}", 1, size), trials, 3
     )
     kept, doubted, told, pose = jaxro.clean_batch(pairs, procedure, select=rejection)

@@ -16,7 +16,7 @@ from jaxro.assessment import correlated_covariance, neighbours, pattern, pooled
 from jaxro.cli import app
 from jaxro.geometry import mock_pairs
 from jaxro.geometry.linear import linearised
-from jaxro.rejection.robust import improved
+from jaxro.rejection.steps import improve
 
 SIGMA = 0.005
 PHOTO = 140.0
@@ -53,7 +53,7 @@ def programs():
         names = ("x_left", "y_left", "x_right", "y_right")
         pair = mock_pairs.plant(ideal(place), **dict(zip(names, errors, strict=True)))
         pose = jax.lax.fori_loop(
-            0, 4, lambda _, p: improved(pair, p, pair.mask), jaxro.to_pose(elements)
+            0, 4, lambda _, p: improve(pair, p, pair.mask), jaxro.to_pose(elements)
         )
         return neighbours.of_linear(linearised(pair, pose), pair.coordinates)
 

@@ -24,19 +24,17 @@ from jaxro.experiments import (
     dorozhinsky1971,
     dorozhinsky1971_first_order,
 )
-from jaxro.experiments.calibration import adjustable, calibrated
+from jaxro.experiments.calibration import adjustable, calibrate
 from jaxro.experiments.compare import Setting
 from jaxro.geometry import mock_pairs
 from jaxro.geometry.pairs import mask_unusable
 from jaxro.rejection import PROCEDURES, AbstractProcedure, Rejection
-from jaxro.rejection.base import (
+from jaxro.rejection.parallaxes import adjust_parallaxes
+from jaxro.rejection.rounds import (
     Round,
-    began,
-    by_parallax,
-    ended,
-    finished,
-    recorded,
-    values,
+    conclude_round,
+    element_values,
+    finished_outcome,
 )
 from jaxro.tables.examples import mock_pair as mock_example
 
@@ -75,9 +73,10 @@ class Informed(AbstractProcedure):
         pair = mask_unusable(pair)[0]
         off = jnp.abs(pair.y_right - EXACT.y_right)
         bad = pair.mask & (off > self.limit)
-        solved = by_parallax(pair, pair.mask & ~bad)
-        new = Round(off, jnp.asarray(self.limit), bad, off, values(solved.elements))
-        return ended(recorded(began(pair, 1), new), solved, finished(pair))
+        solved = adjust_parallaxes(pair, pair.mask & ~bad)
+        limit, elements = jnp.asarray(self.limit), element_values(solved.elements)
+        only = Round(off, limit, bad, off, elements)
+        return conclude_round(pair, only, solved, finished_outcome(pair))
 
 
 # arrays, not numbers: one compiled program serves all three
@@ -126,7 +125,7 @@ def test_known_procedures_get_exactly_their_shares(shares):
 
 def test_trials_have_their_errors_and_the_angle_is_that_of_the_oracle(shares):
     setting = Setting("rows", 2, 20.0)
-    pairs, wrong = compare.simulated(EXACT, setting, TRIALS, 0)
+    pairs, wrong = compare.simulate(EXACT, setting, TRIALS, 0)
     assert np.all(np.sum(wrong, axis=1) == 2) and len(np.unique(wrong, axis=0)) > 10
     off = np.asarray(pairs.y_right - EXACT.y_right[None, :])
     assert (
@@ -135,8 +134,8 @@ def test_trials_have_their_errors_and_the_angle_is_that_of_the_oracle(shares):
     )
     np.testing.assert_allclose(np.std(off[~wrong]), SIGMA, rtol=0.15)
     again, other = (
-        compare.simulated(EXACT, setting, TRIALS, 0)[0],
-        compare.simulated(EXACT, setting, TRIALS, 1)[0],
+        compare.simulate(EXACT, setting, TRIALS, 0)[0],
+        compare.simulate(EXACT, setting, TRIALS, 1)[0],
     )
     assert np.array_equal(again.y_right, pairs.y_right) and not np.array_equal(
         other.y_right, pairs.y_right
@@ -166,9 +165,9 @@ def test_trials_have_their_errors_and_the_angle_is_that_of_the_oracle(shares):
 
 
 def test_calibration_finds_the_limit_of_a_known_distribution():
-    clean, wrong = compare.simulated(EXACT, Setting("rows", 0, 0.0), 2000, 3)
+    clean, wrong = compare.simulate(EXACT, Setting("rows", 0, 0.0), 2000, 3)
     assert not wrong.any()
-    found = calibrated(Informed(0.001), clean, 0.2)
+    found = calibrate(Informed(0.001), clean, 0.2)
     # the largest of sixteen |error| / sigma exceeds z in a fifth of the pairs
     z = NormalDist().inv_cdf((1 + 0.8 ** (1 / 16)) / 2)
     assert found.name == "limit" and abs(found.value / (z * SIGMA) - 1) < 0.04
@@ -178,7 +177,7 @@ def test_calibration_finds_the_limit_of_a_known_distribution():
         adjustable(PROCEDURES["three-sigma"]) == "factor"
         and adjustable(PROCEDURES["grubbs"]) == "level"
     )
-    none = calibrated(PROCEDURES["dorozhinsky"], clean, 0.2)
+    none = calibrate(PROCEDURES["dorozhinsky"], clean, 0.2)
     assert none.procedure is None and "not adjustable" in none.reason
 
 
@@ -363,7 +362,7 @@ def test_counts_of_1989_add_up(monkeypatch):
         seen.append(wrong[:n])
         return first, np.roll(first, 1, axis=1)
 
-    monkeypatch.setattr(burshtynskaya1989, "rejected", stages)
+    monkeypatch.setattr(burshtynskaya1989, "reject", stages)
     monkeypatch.setattr(
         burshtynskaya1989, "excesses", lambda pairs: np.zeros(pairs.x_left.shape)
     )

@@ -214,7 +214,7 @@ def test_equations_9_and_10_by_the_papers_own_rule(equation):
     (9), the sign of v5 of (10)."""
     zones, printed = first_order.EQUATIONS[equation]
     q = np.eye(len(zones))[6]
-    v = oracles.first_order(zones) @ first_order.averaged(zones, q) + q
+    v = oracles.first_order(zones) @ first_order.average(zones, q) + q
     np.testing.assert_allclose(36 * v, PAPERS_RULE[equation], atol=1e-12)
     np.testing.assert_allclose(
         first_order.by_the_papers_rule(equation), PAPERS_RULE[equation], atol=1e-12
@@ -247,7 +247,7 @@ def test_equations_6_7_and_8_for_any_focal_length_base_and_y():
     equations (5) but for omega'."""
     f, b, y = 152.0, 71.0, 83.0
     zones, _ = first_order.EQUATIONS[9]
-    alpha, chi, omega, alpha_right, chi_right = first_order.averaged(
+    alpha, chi, omega, alpha_right, chi_right = first_order.average(
         zones, np.eye(7)[6], f, b, y
     )
     np.testing.assert_allclose(alpha, -f / (4 * b * y))
@@ -255,7 +255,7 @@ def test_equations_6_7_and_8_for_any_focal_length_base_and_y():
     np.testing.assert_allclose([alpha_right, chi_right], [0, f / b * omega])
     np.testing.assert_allclose(chi, (f**2 / y**2 - 1 / 3) / (6 * b))
     q = np.array([0.3, -0.2, 0.5, 0.1, -0.4, 0.7, 0.2])
-    _, chi, omega, *_ = first_order.averaged(zones, q, f, b, y)
+    _, chi, omega, *_ = first_order.average(zones, q, f, b, y)
     printed = (f / b + 2 * y * y / (3 * f * b)) * omega - (
         q[3] + 2 * q[1] + 2 * q[5] + q[6]
     ) / (6 * b)
@@ -269,7 +269,7 @@ def test_equations_6_7_and_8_for_any_focal_length_base_and_y():
     six = zones[:6]
     a = first_order.coefficients(six, f, b, y)
     np.testing.assert_allclose(
-        first_order.averaged(six, -a @ true, f, b, y), true, rtol=1e-12
+        first_order.average(six, -a @ true, f, b, y), true, rtol=1e-12
     )
 
 

@@ -401,7 +401,7 @@ def test_grubbs_formula_rejects_a_good_point_of_nearly_every_second_pair():
 def test_calibrated_values_keep_the_level(exact):
     """In the first round on other pairs of the layout: 5 % within three standard errors
     of either mock_pairs."""
-    procedure = rejection.calibrated(
+    procedure = rejection.calibrate(
         LeaveOneOutGrubbs(exact=exact),
         mock_pairs.mock_pair(ROWS),
         jax.random.key(1),

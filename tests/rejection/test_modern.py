@@ -20,8 +20,9 @@ from jaxro.rejection import (
     Ransac,
     Reweighting,
 )
-from jaxro.rejection.hypotheses import Newton, subsets
+from jaxro.rejection.hypotheses import Newton
 from jaxro.rejection.least_median import median
+from jaxro.rejection.subsets import choose_places
 
 judge = pytest.importorskip(
     "oracles_robust", reason="NumPy's critical values need scipy", exc_type=ImportError
@@ -221,7 +222,7 @@ def test_least_median_of_few_points_is_not_the_fit_of_five(points):
 
 def test_subsets_are_equally_likely():
     uniform = jnp.asarray(np.random.default_rng(1).random((5, 20_000), np.float32))
-    drawn = np.sort(subsets(uniform, jnp.asarray(7.0)), axis=0)
+    drawn = np.sort(choose_places(uniform, jnp.asarray(7.0)), axis=0)
     assert np.all(np.diff(drawn, axis=0) > 0) and drawn.min() == 0 and drawn.max() == 6
     _, counts = np.unique(drawn, axis=1, return_counts=True)
     assert (

@@ -36,7 +36,7 @@ def pairs():
     pairs = jax.vmap(lambda key: mock_pairs.noisy(near, key, 0.01))(keys)
     wrong = np.zeros((4, POINTS))
     wrong[0, 3], wrong[1, 7] = 0.4, -1.0
-    return mock_pairs.planted(pairs, y_right=jnp.asarray(wrong))
+    return mock_pairs.plant(pairs, y_right=jnp.asarray(wrong))
 
 
 def check(call: Callable[[], object]) -> None:

@@ -122,8 +122,7 @@ def constraints(basis: Float[Array, "4 3 3 problem"]) -> Float[Array, "10 20 pro
 
 
 def _elimination(m: Float[Array, "10 20 problem"]) -> Float[Array, "3 3 5 problem"]:
-    """B(z): three equations B (x, y, 1)ᵀ = 0, [equation, unknown, power of z], from the
-    last six reduced rows."""
+    """B(z) of `equations_in_z`, by Householder reflections."""
 
     def reflect(m, _):
         m = reflected(reflector(m[:, 0]), m)
@@ -141,6 +140,14 @@ def _elimination(m: Float[Array, "10 20 problem"]) -> Float[Array, "3 3 5 proble
     reduced, _ = lax.scan(
         substitute, jnp.zeros_like(rows[4:, 10:]), rows[4:], reverse=True
     )
+    return equations_in_z(reduced)
+
+
+def equations_in_z(
+    reduced: Float[Array, "6 10 problem"],
+) -> Float[Array, "3 3 5 problem"]:
+    """B(z): three equations B (x, y, 1)ᵀ = 0, [equation, unknown, power of z], from the
+    last six rows of the eliminated cubics."""
     # ascending powers of z: rows e, f of x²z, x² (then y², xy) combine to e - z f
     reduced = reduced.reshape(3, 2, 10, -1)
     parts = [reduced[:, :, i:j][:, :, ::-1] for i, j in ((0, 3), (3, 6), (6, 10))]
