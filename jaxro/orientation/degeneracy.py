@@ -16,7 +16,6 @@ from ..adjustment.normal_equations import inner, quadratic
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import AbstractElements
 from ..geometry.pairs import Pair
-from ..xla.kernels import computed_once
 from ..xla.passes import sums
 from .inspection import Inspection
 
@@ -101,7 +100,7 @@ def _worst_of(elements: AbstractElements, cofactor: Float[Array, "5 5"]) -> list
     """The worst determined direction, of length 1 in rad, in the units of the
     elements."""
     in_rad, units = in_radians(elements, cofactor)
-    direction = computed_once(_worst)(in_rad)
+    direction = _worst(in_rad)
     length = jnp.sqrt(sum((e * e for e in direction), jnp.zeros(())))
     return [e / length * unit for e, unit in zip(direction, units, strict=True)]
 
@@ -166,8 +165,7 @@ def _along_columns(
     focals = pair.focal_left, pair.focal_right
     fundamental = lambda r, b: coplanarity.fundamental_matrix(r, b, *focals)
     _, slopes = elements.slopes(fundamental, (jnp.zeros_like(pair.focal_left),) * 5)
-    products = lambda slopes: [inner(by_entry, slope) for slope in slopes]
-    return computed_once(products)(slopes)
+    return [inner(by_entry, slope) for slope in slopes]
 
 
 def _plus(a: rot.Matrix, b: rot.Matrix) -> rot.Matrix:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from ..adjustment.normal_equations import accumulate, solve
 from ..geometry.elements import RelativePose, vertical
