@@ -22,7 +22,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pycolmap
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..batches.batch import clean_in_stages
@@ -30,11 +29,11 @@ from ..batches.buckets import buckets
 from ..batches.padding import FEWER
 from ..geometry.coplanarity import fundamental_matrix, linearise
 from ..geometry.elements import RelativePose
-from ..geometry.pairs import Pair
+from ..geometry.pairs import Pair, pair
 from ..rejection.classification import ENGINE, Found, Verdict, classify, verdict
 from ..xla.programs import Program
 from ..xla.slabs import Progress, Split, map_chunks, silent, spread
-from .cameras import NO_POINTS, PhotoPoints, camera_matrix, focal_length, to_photo
+from .cameras import NO_RAY, PhotoPoints, camera_matrix, focal_length, to_photo
 from .database import Database, Matches, images_of
 
 TOGETHER = 2_000_000
@@ -56,25 +55,31 @@ directions do not matter."""
 Places = Int[np.ndarray, "pair match"]
 
 
-class Photos(NamedTuple):
-    """The images that are matched: their cameras, all their keypoints one image after
-    another, and where those of an image begin and end."""
+class Photo(NamedTuple):
+    """A matched image: matrix of its camera, the place of its first keypoint among all,
+    and how many it has."""
 
-    cameras: dict[int, pycolmap.Camera]
+    matrix: Float[np.ndarray, "3 3"]
+    begin: int
+    count: int
+
+
+class Photos(NamedTuple):
+    """The matched images by number, and the keypoints of all. The first keypoint
+    belongs to no image and is not seen: padding points to it."""
+
+    of: dict[int, Photo]
     points: PhotoPoints
-    begin: dict[int, int]
-    end: dict[int, int]
 
     @property
-    def counts(self) -> dict[int, int]:
-        """How many keypoints an image has."""
-        return {image: self.end[image] - self.begin[image] for image in self.end}
+    def unseen(self) -> int:
+        """How many keypoints have no photo coordinates."""
+        return int(np.sum(~self.points.seen)) - 1
 
-    def matrices(self, pair_ids: list[int]) -> list[Float[np.ndarray, "pair 3 3"]]:
-        """The matrices of the first and of the second cameras of the pairs."""
-        own = {image: camera_matrix(camera) for image, camera in self.cameras.items()}
-        sides = images_of_pairs(pair_ids)
-        return [np.stack([own[image] for image in side]) for side in sides]
+    def sides(self, pair_ids: list[int]) -> tuple[list[Photo], list[Photo]]:
+        """The first and the second photos of the pairs."""
+        both = [images_of(pair_id) for pair_id in pair_ids]
+        return [self.of[a] for a, _ in both], [self.of[b] for _, b in both]
 
 
 class Block(NamedTuple):
@@ -85,24 +90,6 @@ class Block(NamedTuple):
     found: Found
 
 
-class Cofactors(NamedTuple):
-    """J Jᵀ of the keypoints of one side, as in `PhotoPoints`."""
-
-    xx: Float[Array, "*pairs match"]
-    xy: Float[Array, "*pairs match"]
-    yy: Float[Array, "*pairs match"]
-
-    def along(self, x: Float[Array, "..."], y: Float[Array, "..."]):
-        """The variance of x times the first plus y times the second coordinate."""
-        return self.xx * x * x + 2 * self.xy * x * y + self.yy * y * y
-
-
-def images_of_pairs(pair_ids: list[int]) -> tuple[list[int], list[int]]:
-    """The first and the second images of the pairs."""
-    both = [images_of(pair_id) for pair_id in pair_ids]
-    return [a for a, _ in both], [b for _, b in both]
-
-
 def read_photos(
     database: Database, pair_ids: list[int], assume_calibrated: bool
 ) -> Photos:
@@ -111,18 +98,16 @@ def read_photos(
     cameras = database.cameras(images, assume_calibrated)
     keypoints = database.keypoints(images)
     camera_of = lambda image: images[image].camera
-    numbers = sorted(images, key=camera_of)
-    parts = [NO_POINTS]
-    for camera, own in groupby(numbers, camera_of):
-        pixels = np.concatenate([keypoints[image] for image in own])
-        parts.append(to_photo(pixels, cameras[camera]))
-    ends = np.cumsum([len(keypoints[image]) for image in numbers]).tolist()
-    return Photos(
-        cameras={image: cameras[camera_of(image)] for image in numbers},
-        points=PhotoPoints(*map(np.concatenate, zip(*parts, strict=True))),
-        begin=dict(zip(numbers, [0, *ends], strict=False)),
-        end=dict(zip(numbers, ends, strict=True)),
-    )
+    photos, parts, begin = {}, [NO_RAY], 1
+    for number, own in groupby(sorted(images, key=camera_of), camera_of):
+        camera = cameras[number]
+        matrix, pixels = camera_matrix(camera), []
+        for image in own:
+            pixels.append(keypoints[image])
+            photos[image] = Photo(matrix, begin, len(pixels[-1]))
+            begin += len(pixels[-1])
+        parts.append(to_photo(np.concatenate(pixels), camera))
+    return Photos(photos, PhotoPoints(*map(np.concatenate, zip(*parts, strict=True))))
 
 
 def orient_blocks(
@@ -135,13 +120,15 @@ def orient_blocks(
     """The pairs `matched` (number, number of matches) in blocks, not in their order;
     `sigma` of a keypoint in pixels. Raises TableError."""
     done = 0
+    keypoints = {image: photo.count for image, photo in photos.of.items()}
     lengths = [length for _, length in matched]
     for size, members in buckets(lengths, FEWER).items() if lengths else ():
         most = max(1, TOGETHER // size)
         for begin in range(0, len(members), most):
             pair_ids = [matched[i][0] for i in members[begin : begin + most]]
-            matches = list(database.matches(pair_ids, photos.counts))
-            pairs, places = pad(photos, pair_ids, matches, size, sigma)
+            matches = list(database.matches(pair_ids, keypoints))
+            places = place_matches(photos, pair_ids, matches, size)
+            pairs = pair_up(photos, pair_ids, places, sigma)
             told = lambda count, _, before=done: progress(before + count, len(matched))
             found = orient(pairs, photos.points, places, sigma, told)
             done += len(pair_ids)
@@ -149,44 +136,43 @@ def orient_blocks(
             yield Block(pair_ids, matches, found)
 
 
-def pad(
-    photos: Photos,
-    pair_ids: list[int],
-    matches: list[Matches],
-    size: int,
-    sigma: float,
-) -> tuple[Pair, tuple[Places, Places]]:
-    """The pairs padded to `size`, in NumPy, with the same sigma in all directions, and
-    the places of their left and right keypoints among all.
+def place_matches(
+    photos: Photos, pair_ids: list[int], matches: list[Matches], size: int
+) -> tuple[Places, Places]:
+    """The places of the left and the right keypoints among all, padded to `size`."""
+    left, right = np.zeros((2, len(pair_ids), size), np.int64)
+    for i, (a, b) in enumerate(zip(*photos.sides(pair_ids), strict=True)):
+        count = len(matches[i])
+        left[i, :count] = matches[i][:, 0] + a.begin
+        right[i, :count] = matches[i][:, 1] + b.begin
+    return left, right
 
-    A match with a keypoint that no ray is seen at is masked.
-    """
-    lengths = np.array([len(m) for m in matches])[:, None]
-    number = np.arange(size)[None, :]
-    there = number < lengths
-    row = np.where(there, np.cumsum(lengths)[:, None] - lengths + number, 0)
-    every = np.concatenate([*matches, np.zeros((1, 2), np.int64)])  # there may be none
+
+def pair_up(
+    photos: Photos, pair_ids: list[int], places: tuple[Places, Places], sigma: float
+) -> Pair:
+    """The pairs with the same sigma in all directions, in NumPy. A match with a
+    keypoint that is not seen is masked."""
     points, scale = photos.points, photos.points.scale
-    if not len(scale):  # places without a match need a keypoint to point to
-        points, scale = PhotoPoints(*(np.zeros(1, a.dtype) for a in points)), np.ones(1)
-    coordinates, focals, places = [], [], []
-    square = np.zeros(there.shape)
-    for k, side in enumerate(images_of_pairs(pair_ids)):
-        begin = np.array([photos.begin[image] for image in side])[:, None]
-        place = np.where(there, every[row, k] + begin, 0)
-        there = there & points.seen[place]
-        coordinates += [points.x[place], points.y[place]]
-        square += scale[place] ** 2
-        focals.append(np.array([focal_length(photos.cameras[image]) for image in side]))
-        places.append(place)
+    left, right = places
+    focals = [
+        [focal_length(photo.matrix) for photo in side]
+        for side in photos.sides(pair_ids)
+    ]
     # in place, since the system zeroes every page of a new array
-    square /= 2
-    deviation = np.sqrt(square, out=square)
-    deviation *= sigma
-    for values, empty in (*((c, 0.0) for c in coordinates), (deviation, 1.0)):
-        np.copyto(values, empty, where=~there)
-    pair = Pair(*jax.device_put((*coordinates, deviation, there, *focals)))
-    return jax.tree.map(np.asarray, pair), (places[0], places[1])
+    square = scale[left] ** 2
+    square += scale[right] ** 2
+    square *= sigma**2 / 2
+    pairs = pair(
+        points.x[left],
+        points.y[left],
+        points.x[right],
+        points.y[right],
+        focal=focals,
+        sigma=np.sqrt(square, out=square),
+        mask=points.seen[left] & points.seen[right],
+    )
+    return jax.tree.map(np.asarray, pairs)
 
 
 def orient(
@@ -201,23 +187,21 @@ def orient(
     again = _where_directions_matter(pairs, points, places)
     if again.size:
         some, pose = _rows_of((pairs, verdicts.pose), again)
-        sides = [
-            Cofactors(*jax.device_put([a[place[again]] for a in points[2:5]]))
-            for place in places
-        ]
-        data = some, *sides, pose
-        scale = spread(data, Program(_all_scales, {}), ONE_BY_ONE, 1)
-        some = eqx.tree_at(lambda pair: pair.sigma, some, sigma * scale)
+        left, right = (_rows_of(points, place[again]) for place in places)
+        scale = spread(
+            (some, left, right, pose), Program(_scale_all, {}), ONE_BY_ONE, chunk=1
+        )
+        some = eqx.tree_at(lambda one: one.sigma, some, sigma * scale)
         new = clean_in_stages(some, ENGINE, verdict, ONE_BY_ONE, silent)
         pairs, verdicts = _with_rows((pairs, verdicts), again, (some, new))
-    return spread((pairs, verdicts), Program(_classify_all, {}), ONE_BY_ONE, 1)
+    return spread((pairs, verdicts), Program(_classify_all, {}), ONE_BY_ONE, chunk=1)
 
 
 def _classify_all(verdicts: tuple[Pair, Verdict]) -> Found:
     return map_chunks(lambda one: classify(*one), verdicts, 1)
 
 
-def _all_scales(data: tuple) -> Float[Array, "pair match"]:
+def _scale_all(data: tuple) -> Float[Array, "pair match"]:
     return map_chunks(lambda one: scale_by_direction(*one), data, 1)
 
 
@@ -227,16 +211,18 @@ def _where_directions_matter(
     """The pairs with a match whose variances differ by more than ROUND, be it along two
     directions or in the two photos."""
     least, most = points.variances
-    if np.max(most, initial=0) <= ROUND * np.min(least[points.seen], initial=np.inf):
+    everywhere = ROUND * np.min(least[points.seen], initial=np.inf)
+    if np.max(most, initial=0) <= everywhere:
         return np.zeros(0, int)
     left, right = places
     lower = np.minimum(least[left], least[right])
-    uneven = np.maximum(most[left], most[right]) > ROUND * lower
-    return np.flatnonzero(np.any(pairs.mask & uneven, axis=1))
+    upper = np.maximum(most[left], most[right])
+    uneven = pairs.mask & (upper > ROUND * lower)
+    return np.flatnonzero(np.any(uneven, axis=1))
 
 
 def scale_by_direction(
-    pair: Pair, left: Cofactors, right: Cofactors, pose: RelativePose
+    pair: Pair, left: PhotoPoints, right: PhotoPoints, pose: RelativePose
 ) -> Float[Array, " match"]:
     """sqrt(B Q Bᵀ / B Bᵀ) of every match, B of this pose; 1 where B is zero."""
     f = fundamental_matrix(*pose.relative(), pair.focal_left, pair.focal_right)
@@ -245,12 +231,13 @@ def scale_by_direction(
         _, square, b = linearise(f, point, use)
         fair = use & (square > 0)
         variance = left.along(b[0], b[1]) + right.along(b[2], b[3])
-        return jnp.sqrt(jnp.where(fair, variance / jnp.where(fair, square, 1.0), 1.0))
+        ratio = variance / jnp.where(fair, square, 1.0)
+        return jnp.sqrt(jnp.where(fair, ratio, 1.0))
 
     return jax.vmap(scale)(pair.coordinates, pair.mask, left, right)
 
 
-def _rows_of(tree: PyTree, rows: Int[np.ndarray, " some"]) -> PyTree:
+def _rows_of(tree: PyTree, rows: Int[np.ndarray, "..."]) -> PyTree:
     """These rows of the arrays of a tree."""
     return jax.tree.map(lambda a: np.asarray(a)[rows], tree)
 

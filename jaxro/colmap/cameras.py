@@ -15,12 +15,13 @@ Only rays in front of the photo plane have photo coordinates: a fisheye may also
 beside and behind it.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float
+
+TURN = 2 * np.pi
 
 WIDEST = 100.0
 """Largest |(u, v)| that is used, 89.4° off the axis: nearer to a right angle an error
@@ -55,84 +56,87 @@ class PhotoPoints(NamedTuple):
     def scale(self) -> Values:
         """sqrt(|det J|): the growth of an error in the mean (geometric) of all
         directions."""
-        return np.sqrt(np.sqrt(np.abs(self.xx * self.yy - self.xy**2)))
+        squared = np.abs(self.xx * self.yy - self.xy**2)
+        return np.sqrt(np.sqrt(squared))
+
+    def along(self, x: Values, y: Values) -> Values:
+        """The cofactor of x times the first plus y times the second coordinate."""
+        mixed = 2 * self.xy * x * y
+        return self.xx * x * x + mixed + self.yy * y * y
 
     @property
     def variances(self) -> tuple[Values, Values]:
         """The smallest and the largest eigenvalue of J Jᵀ."""
         mean = (self.xx + self.yy) / 2
-        half = np.hypot((self.xx - self.yy) / 2, self.xy)
+        difference = (self.xx - self.yy) / 2
+        half = np.hypot(difference, self.xy)
         return mean - half, mean + half
 
 
-NO_POINTS = PhotoPoints(*(np.zeros(0) for _ in range(5)), np.zeros(0, bool))
-
-
-def _is_panorama(camera: pycolmap.Camera) -> bool:
-    """Whether the parameters are width and height of a panorama (EQUIRECTANGULAR)."""
-    return not camera.focal_length_idxs()
-
-
-def focal_length(camera: pycolmap.Camera) -> float:
-    """f of the photo coordinates, in pixels; of a panorama the pixels of a radian."""
-    if _is_panorama(camera):
-        return float(camera.params[0]) / (2 * math.pi)
-    return float(camera.mean_focal_length())
+NO_RAY = PhotoPoints(*(np.zeros(1) for _ in range(5)), np.zeros(1, bool))
+"""One keypoint that is not seen."""
 
 
 def camera_matrix(camera: pycolmap.Camera) -> Float[np.ndarray, "3 3"]:
-    """K: pixels of the image free of distortion = K (u, v, 1)."""
-    if _is_panorama(camera):
-        f, (width, height) = focal_length(camera), camera.params
-        return np.array([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
-    return camera.calibration_matrix()
+    """K: pixels of the image free of distortion = K (u, v, 1). Of a panorama, whose
+    parameters are width and height, the focal length is the pixels of a radian."""
+    if camera.focal_length_idxs():
+        return camera.calibration_matrix()
+    width, height = camera.params
+    matrix = np.diag([width / TURN, width / TURN, 1.0])
+    matrix[:2, 2] = width / 2, height / 2
+    return matrix
+
+
+def focal_length(matrix: Float[np.ndarray, "3 3"]) -> float:
+    """f of the photo coordinates, in pixels."""
+    return float(matrix[0, 0] + matrix[1, 1]) / 2
 
 
 def to_photo(
     pixels: Float[np.ndarray, "point 2"], camera: pycolmap.Camera
 ) -> PhotoPoints:
     """Photo coordinates and cofactors of the keypoints of one camera."""
-    f = focal_length(camera)
-    if camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
-        return _without_distortion(pixels, camera, f)
-    with np.errstate(all="ignore"):  # keypoints without a ray: masked at the end
+    matrix = camera_matrix(camera)
+    f = focal_length(matrix)
+    with np.errstate(all="ignore"):  # keypoints without a ray are masked at the end
         u, v = np.asarray(camera.cam_from_img(pixels)).T
         seen = u * u + v * v < WIDEST**2
-        u, v = np.where(seen, u, 0.0), np.where(seen, v, 0.0)
-        off = _project(camera, u, v) - pixels
-        step = STEP * np.sqrt(1 + u * u + v * v)
-        along_u = _project(camera, u + step, v) - _project(camera, u - step, v)
-        along_v = _project(camera, u, v + step) - _project(camera, u, v - step)
-        along_u, along_v = (a / (2 * step[:, None]) for a in (along_u, along_v))
-        det = along_u[:, 0] * along_v[:, 1] - along_u[:, 1] * along_v[:, 0]
-        # beside and behind the photo pycolmap gives (u, v) of some other ray, and beyond
-        # a fold of the distortion one that is seen mirrored
-        seen &= (np.sum(off * off, axis=1) < ACCURATE**2) & (det > 0)
-        dot = lambda a, b: np.sum(a * b, axis=1) * (f / det) ** 2
-        found = PhotoPoints(
-            x=f * u,
-            y=-f * v,
-            xx=dot(along_v, along_v),
-            xy=dot(along_u, along_v),
-            yy=dot(along_u, along_u),
-            seen=seen,
-        )
-    return PhotoPoints(*(np.where(seen, values, 0) for values in found[:-1]), seen)
+        if camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
+            by_u, by_v = matrix[None, :2, :2].T
+        else:
+            u = np.where(seen, u, 0.0)
+            v = np.where(seen, v, 0.0)
+            # beside and behind the photo pycolmap gives (u, v) of some other ray
+            again = _project(camera, u, v)
+            seen &= np.all(np.abs(again - pixels) < ACCURATE, axis=1)
+            by_u, by_v = _slopes(camera, u, v)
+        det = by_u[0] * by_v[1] - by_u[1] * by_v[0]
+        seen &= det > 0  # beyond a fold of the distortion the image is mirrored
+        # J Jᵀ is the inverse of the products of the slopes
+        factor = (f / det) ** 2
+        xx = factor * (by_v[0] ** 2 + by_v[1] ** 2)
+        xy = factor * (by_u[0] * by_v[0] + by_u[1] * by_v[1])
+        yy = factor * (by_u[0] ** 2 + by_u[1] ** 2)
+        fields = f * u, -f * v, xx, xy, yy
+    fields = (np.where(seen, values, 0.0) for values in fields)
+    return PhotoPoints(*fields, seen)
 
 
-def _project(camera: pycolmap.Camera, u: Values, v: Values) -> np.ndarray:
+def _project(
+    camera: pycolmap.Camera, u: Values, v: Values
+) -> Float[np.ndarray, "point 2"]:
     """The pixels at which rays (u, v, 1) are seen."""
-    return np.asarray(camera.img_from_cam(np.stack([u, v, np.ones_like(u)], axis=1)))
+    rays = np.stack([u, v, np.ones_like(u)], axis=1)
+    return np.asarray(camera.img_from_cam(rays))
 
 
-def _without_distortion(
-    pixels: Float[np.ndarray, "point 2"], camera: pycolmap.Camera, f: float
-) -> PhotoPoints:
-    """The same in closed form."""
-    (fx, _, cx), (_, fy, cy), _ = camera.calibration_matrix()
-    x, y = f * ((pixels[:, 0] - cx) / fx), -f * ((pixels[:, 1] - cy) / fy)
-    seen = np.isfinite(x + y)
-    full = lambda value: np.full(len(pixels), value)
-    if not np.all(seen):
-        x, y = np.where(seen, x, 0.0), np.where(seen, y, 0.0)
-    return PhotoPoints(x, y, full((f / fx) ** 2), full(0.0), full((f / fy) ** 2), seen)
+def _slopes(
+    camera: pycolmap.Camera, u: Values, v: Values
+) -> tuple[Float[np.ndarray, "2 point"], Float[np.ndarray, "2 point"]]:
+    """d(pixel)/du and d(pixel)/dv by central differences."""
+    step = STEP * np.sqrt(1 + u * u + v * v)
+    by_u = _project(camera, u + step, v) - _project(camera, u - step, v)
+    by_v = _project(camera, u, v + step) - _project(camera, u, v - step)
+    both = 2 * step
+    return by_u.T / both, by_v.T / both

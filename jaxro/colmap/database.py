@@ -53,17 +53,13 @@ class Image(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """A row of two_view_geometries by the names of its columns; None where there is
-    nothing."""
+    """A row of two_view_geometries; `matrices`: those of F, E, H, qvec and tvec that
+    there are, by the names of the columns."""
 
     pair_id: int
     matches: Matches
     config: int
-    F: Float[np.ndarray, "3 3"] | None = None
-    E: Float[np.ndarray, "3 3"] | None = None
-    H: Float[np.ndarray, "3 3"] | None = None
-    qvec: Float[np.ndarray, "4"] | None = None
-    tvec: Float[np.ndarray, "3"] | None = None
+    matrices: dict[str, Float[np.ndarray, "..."]]
 
 
 def images_of(pair_id: int) -> tuple[int, int]:
@@ -116,10 +112,8 @@ class Database:
         for pair_id in pair_ids:
             for number in images_of(pair_id):
                 if number not in known:
-                    row, expected = (
-                        f"pair_id {pair_id}",
-                        "an image of the table images; match the images again",
-                    )
+                    row = f"pair_id {pair_id}"
+                    expected = "an image of the table images; match the images again"
                     raise self.error("matches", row, None, f"image {number}", expected)
                 found[number] = known[number]
         return found
@@ -133,7 +127,8 @@ class Database:
         rows = {number: rest for number, *rest in self._rows("cameras")}
         for number, image in images.items():
             if image.camera not in rows:
-                row, expected = _row_of(number, image), "a camera of the table cameras"
+                row = _row_of(number, image)
+                expected = "a camera of the table cameras"
                 raise self.error(
                     "images", row, "camera_id", str(image.camera), expected
                 )
@@ -141,10 +136,10 @@ class Database:
         found = {number: self._camera(number, *rows[number]) for number in wanted}
         for number, camera in found.items():
             if not (camera.has_prior_focal_length or assume_calibrated):
-                row, expected = (
-                    f"camera_id {number}",
+                row = f"camera_id {number}"
+                expected = (
                     "1: a focal length that is known; calibrate, or give "
-                    "--assume-calibrated if it is good to 1 %",
+                    "--assume-calibrated if it is good to 1 %"
                 )
                 raise self.error("cameras", row, "prior_focal_length", "0", expected)
         return found
@@ -191,10 +186,8 @@ class Database:
             found[number] = values.reshape(rows, cols)[:, :2].astype(np.float64)
         for number, image in images.items():
             if number not in found:
-                row, expected = (
-                    _row_of(number, image),
-                    "the keypoints of a matched image",
-                )
+                row = _row_of(number, image)
+                expected = "the keypoints of a matched image"
                 raise self.error("keypoints", row, None, "no such row", expected)
         return found
 
@@ -258,7 +251,7 @@ class Database:
         rows = []
         for one in geometries:
             matches = one.matches.astype("<u4").tobytes() or None
-            blobs = [_blob(getattr(one, name)) for name in matrices]
+            blobs = [_blob(one.matrices.get(name)) for name in matrices]
             rows.append((one.pair_id, len(one.matches), 2, matches, one.config, *blobs))
         self._connection.executemany(
             f"INSERT OR REPLACE INTO two_view_geometries ({', '.join(columns)}) "

@@ -21,9 +21,8 @@ def open_database(file: Path, out: Path | None, force: bool) -> Iterator[Databas
     """The database, or a copy of it at `out`, in a transaction that takes effect when
     the block ends without an error; after one nothing is changed. Raises TableError."""
     if not file.is_file():
-        raise TableError(
-            file, found="no such file", expected="a COLMAP database; check the path"
-        )
+        expected = "a COLMAP database; check the path"
+        raise TableError(file, found="no such file", expected=expected)
     if out is not None and out.absolute() == file.absolute():
         out = None
     if out is None:
@@ -93,22 +92,18 @@ def _explain_errors(file: Path, written: Path | None = None) -> Iterator[None]:
         )
         raise TableError(written or file, found=str(error), expected=expected) from None
     except sqlite3.DatabaseError as error:
-        raise TableError(
-            file, found=str(error), expected="a sound SQLite database made by COLMAP"
-        ) from None
+        expected = "a sound SQLite database made by COLMAP"
+        raise TableError(file, found=str(error), expected=expected) from None
     except OSError as error:
         found = error.strerror or str(error)
-        raise TableError(
-            written or file, found=found, expected="a file that can be written"
-        ) from None
+        expected = "a file that can be written"
+        raise TableError(written or file, found=found, expected=expected) from None
 
 
 def _check_empty(database: Database, force: bool) -> None:
     """Raises TableError if geometries would be replaced without `force`."""
     count = database.geometries()
     if count and not force:
-        found, expected = (
-            f"{count} two-view geometries",
-            "none, or --force to replace them",
-        )
+        found = f"{count} two-view geometries"
+        expected = "none, or --force to replace them"
         raise database.error("two_view_geometries", None, None, found, expected)

@@ -58,7 +58,7 @@ def geometries(
                 pair_id=pair_id,
                 matches=given[found.kept[i, : len(given)]],
                 config=CONFIG[kind],
-                **{name: columns[name][i] for name in CONTENT[kind]},
+                matrices={name: columns[name][i] for name in CONTENT[kind]},
             )
         )
     return rows
@@ -67,18 +67,23 @@ def geometries(
 def matrices(found: Found, k1: Matrices, k2: Matrices) -> dict[str, np.ndarray]:
     """F, E, H, qvec and tvec of every pair; without a base H and tvec are those of the
     rotation alone."""
-    signs = np.array([1.0, -1.0, -1.0])
-    rotation = signs[:, None] * np.swapaxes(found.rotation, 1, 2) * signs
+    signs = np.array([1.0, -1.0, -1.0])  # the diagonal of D
+    rotation = np.swapaxes(found.rotation, 1, 2)
+    rotation = signs[:, None] * rotation * signs
     t = -np.einsum("pij,pj->pi", rotation, signs * found.base)
-    t = np.where((found.kind == Kind.rotation)[:, None], 0.0, t)
-    essential = np.stack([np.cross(t, rotation[:, :, k]) for k in range(3)], axis=-1)
-    k1_inverse, k2_inverse = np.linalg.inv(k1), np.linalg.inv(k2)
+    without_base = found.kind == Kind.rotation
+    t = np.where(without_base[:, None], 0.0, t)
+    columns = [np.cross(t, rotation[:, :, k]) for k in range(3)]
+    essential = np.stack(columns, axis=-1)
     plane = t[:, :, None] * (signs * found.normal)[:, None, :]
+    k1_inverse = np.linalg.inv(k1)
+    k2_inverse_transposed = np.swapaxes(np.linalg.inv(k2), 1, 2)
+    # the inverse of a rotation, its axis mirrored by D: of the quaternion -x
+    quaternion = np.asarray(found.quaternion) * np.array([1.0, -1.0, 1.0, 1.0])
     return {
-        "F": np.swapaxes(k2_inverse, 1, 2) @ essential @ k1_inverse,
+        "F": k2_inverse_transposed @ essential @ k1_inverse,
         "E": essential,
         "H": k2 @ (rotation + plane) @ k1_inverse,
-        # the inverse, turned half about x (D): of the quaternion x changes its sign
-        "qvec": np.asarray(found.quaternion) * np.array([1.0, -1.0, 1.0, 1.0]),
+        "qvec": quaternion,
         "tvec": t,
     }

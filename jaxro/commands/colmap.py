@@ -49,7 +49,7 @@ class Options:
 @dataclass
 class Summary:
     """What became of the pairs: their number, matches and kept matches by kind; sigma0
-    of the oriented; keypoints at which no ray is seen; geometries of pairs without
+    of the oriented; keypoints without photo coordinates; geometries of pairs without
     matches; seconds."""
 
     pairs: Counter[Kind] = field(default_factory=Counter)
@@ -92,9 +92,12 @@ def orient_database(options: Options, told: Progress = silent) -> Summary:
         matched = database.pair_ids()
         pair_ids = [pair_id for pair_id, _ in matched]
         photos = read_photos(database, pair_ids, options.assume_calibrated)
-        summary.unseen = int(np.sum(~photos.points.seen))
+        summary.unseen = photos.unseen
         for block in orient_blocks(database, photos, matched, options.sigma, told):
-            k1, k2 = photos.matrices(block.pair_ids)
+            k1, k2 = (
+                np.stack([photo.matrix for photo in side])
+                for side in photos.sides(block.pair_ids)
+            )
             rows = geometries(block.pair_ids, block.matches, block.found, k1, k2)
             database.write(rows)
             summary.add(block, rows)
@@ -113,21 +116,19 @@ def _show(console: Console, options: Options, summary: Summary) -> None:
         "kept",
         markup=False,
     )
-    rows = table(
-        "outcome", "pairs", "matches", "kept", "kept [%]", "written as", left=1
-    )
-    for kind in Kind:
+    heads = "outcome", "pairs", "matches", "kept", "kept [%]", "written as"
+    rows = table(*heads, left=1)
+    counters = summary.pairs, summary.matches, summary.kept
+    for kind, (outcome, written) in MEANING.items():
         if summary.pairs[kind]:
             share = 100 * summary.kept[kind] / max(summary.matches[kind], 1)
-            counts = [
-                str(c[kind]) for c in (summary.pairs, summary.matches, summary.kept)
-            ]
-            rows.add_row(MEANING[kind][0], *counts, number(share, 1), MEANING[kind][1])
+            counts = [str(counter[kind]) for counter in counters]
+            rows.add_row(outcome, *counts, number(share, 1), written)
     console.print(rows)
     if summary.unseen:
         console.print(
-            f"{summary.unseen} keypoints lie where the distortion shows no ray; their "
-            "matches are out."
+            f"{summary.unseen} keypoints have no photo coordinates (beyond what the "
+            "distortion shows, or more than 89° off the axis); their matches are out."
         )
     if summary.untouched:
         console.print(

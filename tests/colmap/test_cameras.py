@@ -74,7 +74,7 @@ def test_rays_are_those_of_colmap(model):
     """Whatever is seen is projected back to its pixel, and whatever is projected back
     is seen."""
     camera, pixels = camera_of(model), random_pixels()
-    found, f = to_photo(pixels, camera), focal_length(camera)
+    found, f = to_photo(pixels, camera), focal_length(camera_matrix(camera))
     rays = np.stack([found.x, -found.y, np.full(500, f)], axis=1)
     back = camera.img_from_cam(rays[found.seen])
     np.testing.assert_allclose(back, pixels[found.seen], atol=1e-6)
@@ -97,7 +97,7 @@ def test_rays_are_those_of_colmap(model):
 def test_cofactors_are_those_of_finite_differences(model):
     """J of the rays that pycolmap itself finds half a step beside each keypoint."""
     camera, pixels, step = camera_of(model), random_pixels(), 1e-3
-    found, f = to_photo(pixels, camera), focal_length(camera)
+    found, f = to_photo(pixels, camera), focal_length(camera_matrix(camera))
     seen = found.seen & (np.hypot(found.x, found.y) < 5 * f)
 
     def photo(offset):

@@ -1,8 +1,10 @@
 """`jaxro colmap` against COLMAP itself: databases made by pycolmap, geometries that it
 reads and builds upon."""
 
+import runpy
 import shutil
 import sqlite3
+import sys
 from contextlib import closing
 
 import jax
@@ -590,6 +592,12 @@ def test_a_locked_database_is_told(scene, tmp_path):
         )
         assert not list(tmp_path.glob("*copy*"))
     other.close()
+
+
+def test_a_missing_pycolmap_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(SystemExit, match=r"pip install 'jaxro\[cli,colmap\]'"):
+        runpy.run_path(sys.modules["jaxro.colmap"].__file__)
 
 
 def test_every_kind_is_explained():
