@@ -116,9 +116,10 @@ def write_baseline(baseline: Baseline) -> None:
 
 
 def _entry(metric: Metric) -> dict[str, Any]:
-    goal = {} if metric.goal is None else {"goal": metric.goal}
-    value = float(f"{metric.value:.4g}")
-    return {"value": value, "unit": metric.unit, "better": metric.direction} | goal
+    short = lambda number: float(f"{number:.4g}")
+    goal = {} if metric.goal is None else {"goal": short(metric.goal)}
+    found = {"value": short(metric.value), "unit": metric.unit}
+    return found | {"better": metric.direction} | goal
 
 
 def _json(value: Any) -> str:
