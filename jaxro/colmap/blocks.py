@@ -227,10 +227,15 @@ def scale_by_direction(
     """sqrt(B Q Bᵀ / B Bᵀ) of every match, B of this pose; 1 where B is zero."""
     f = fundamental_matrix(*pose.relative(), pair.focal_left, pair.focal_right)
 
+    def variance_along(keypoint: PhotoPoints, x, y):
+        mixed = 2 * keypoint.xy * x * y
+        return keypoint.xx * x * x + mixed + keypoint.yy * y * y
+
     def scale(point, use, left, right):
         _, square, b = linearise(f, point, use)
         fair = use & (square > 0)
-        variance = left.along(b[0], b[1]) + right.along(b[2], b[3])
+        variance = variance_along(left, b[0], b[1])
+        variance += variance_along(right, b[2], b[3])
         ratio = variance / jnp.where(fair, square, 1.0)
         return jnp.sqrt(jnp.where(fair, ratio, 1.0))
 

@@ -59,11 +59,6 @@ class PhotoPoints(NamedTuple):
         squared = np.abs(self.xx * self.yy - self.xy**2)
         return np.sqrt(np.sqrt(squared))
 
-    def along(self, x: Values, y: Values) -> Values:
-        """The cofactor of x times the first plus y times the second coordinate."""
-        mixed = 2 * self.xy * x * y
-        return self.xx * x * x + mixed + self.yy * y * y
-
     @property
     def variances(self) -> tuple[Values, Values]:
         """The smallest and the largest eigenvalue of J Jᵀ."""

@@ -1,7 +1,7 @@
 """What the orientation of an image pair from its automatic matches is worth.
 
-Pose and kept matches are those of the procedure `recommended`, unchanged where the pair
-is `oriented`. What is told here besides is what they mean:
+Pose and kept matches come from the procedure `recommended` and stay unchanged if the
+pair is `oriented`. Here they are classified:
 
 1. Where most matches lie in one plane, they have a second pose (`planes`), which
    replaces the first one if it has more of them in front of both photos.
@@ -44,18 +44,20 @@ ACCIDENTS = 1e-3
 """Sets as good that may be expected by accident: as many as the engine allows."""
 
 ROUNDS = 10
-"""Turns of least squares and judgement for the second pose of a plane scene."""
+"""Largest number of turns (solve, judge every match) for the second pose of a plane
+scene."""
 
 TURNS = 3
-"""Of the rotation without a base, each by the matches that the last one takes along."""
+"""Turns to find the rotation without a base: each one uses the matches that the last
+rotation explains."""
 
 ALIKE, CHANCE = 3.0, 0.05
-"""Wrong matches that agree on a base chosen for them, and the share of the others that
-agree by chance."""
+"""Where there is no base: number of wrong matches that agree on any base, and the share
+of the other wrong matches that agree with it by chance."""
 
 PLANE = 0.8
-"""Share of the matches that agree with a pose from which on the plane they lie in alone
-determines it."""
+"""If at least this share of the matches that agree with a pose lies in one plane, only
+the plane determines the pose."""
 
 
 class Kind(enum.IntEnum):
@@ -70,8 +72,8 @@ class Kind(enum.IntEnum):
 
 
 class Found(eqx.Module):
-    """Matches kept, the pose by them (w, x, y, z; R; unit base), n of the plane n · λ
-    p1 / f1 = 1 nearest to them, and what that is worth: sigma0 and the number of a
+    """Matches kept, the pose by them (quaternion w, x, y, z; R; unit base), the normal n
+    of the plane n · λ p1 / f1 = 1 nearest to them, sigma0, and the number of a
     `Kind`."""
 
     kept: Bool[Array, "*pairs match"]
@@ -110,21 +112,21 @@ def verdict(rejection: Rejection) -> Verdict:
 
 
 def classify(pair: Pair, verdict: Verdict) -> Found:
-    """What the verdict of the engine on a pair is worth."""
+    """The kind of a pair, from the verdict of the engine on it."""
     pair = mask_unusable(pair)[0]
     each = lambda n: critical_values.normal(ENGINE.level / jnp.maximum(n, 1.0))
     limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
     plane = in_plane(pair, verdict.pose, verdict.mask, limit)
     pose, use, turned = without_base(pair, plane.pose, plane.use, verdict.result, limit)
     weak = verdict.result == RESULTS.weakly_determined
-    # what lies behind a photo here is infinitely far for its errors
+    # matches behind a photo are here infinitely far within their errors
     fair = (
         is_usable(verdict.result)
         | weak
         | (verdict.result == RESULTS.points_behind_camera)
     )
-    # any base is as good as another one where there is none, so that the engine may
-    # well doubt the one it found
+    # without a base any base is as good as another one, so that the engine may doubt
+    # the base that it found
     convinced = turned | (fair & (verdict.outcome != OUTCOMES.no_consensus))
     kind = jnp.where(plane.alone, int(Kind.plane), int(Kind.oriented))
     for holds, other in (
@@ -148,10 +150,9 @@ def classify(pair: Pair, verdict: Verdict) -> Found:
 def in_plane(
     pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit: Float[Array, ""]
 ) -> Plane:
-    """Whether most matches lie in one plane; if so the second pose in place of the
-    first one, with the matches that agree with it, where it has more of them in front
-    of both photos."""
-    # those, too, that were rejected for lying behind a photo
+    """Whether most matches lie in one plane. If they do, a second pose explains them,
+    too; it replaces the first pose if it has more matches in front of both photos."""
+    # matches that were rejected for lying behind a photo agree, too
     agree = use | (pair.mask & (squares(pair, pose) <= limit**2))
     flat = planes.plane(pair, pose, agree, limit)
     alone = flat.share >= PLANE
@@ -160,22 +161,16 @@ def in_plane(
         needed, first = state
         # depends on the round, or it would be computed of every scene
         inside = mask_unusable(pair.with_mask(pair.mask & needed))[0]
-        other, exists = planes.second(
-            inside.with_mask(inside.mask & flat.within), pose, flat.normal
-        )
-        more = count(flat.within & in_front(inside, other)) > count(
-            flat.within & in_front(inside, pose)
-        )
-        other, others = keep_agreeing(
-            inside, other, inside.mask & flat.within, limit, ROUNDS
-        )
+        in_it = inside.with_mask(inside.mask & flat.within)
+        other, exists = planes.second(in_it, pose, flat.normal)
+        in_front_of_other = count(flat.within & in_front(inside, other))
+        more = in_front_of_other > count(flat.within & in_front(inside, pose))
+        other, others = keep_agreeing(inside, other, in_it.mask, limit, ROUNDS)
         others = others & seen(inside, other, limit)
-        new = Plane(
-            other, others, planes.plane(inside, other, others, limit).normal, alone
-        )
-        return needed & False, jax.tree.map(
-            lambda a, b: jnp.where(needed & exists & more, a, b), new, first
-        )
+        normal = planes.plane(inside, other, others, limit).normal
+        new = Plane(other, others, normal, alone)
+        replace = lambda a, b: jnp.where(needed & exists & more, a, b)
+        return needed & False, jax.tree.map(replace, new, first)
 
     first = Plane(pose, use, flat.normal, alone)
     return while_loop(lambda state: state[0], once, (alone, first), pair.focal_left)[1]
@@ -190,28 +185,25 @@ def without_base(
 ) -> tuple[RelativePose, Bool[Array, "match"], Bool[Array, ""]]:
     """The rotation without a base and its matches where it explains the matches in use,
     and whether it does."""
-    # a large sigma0 hides a base, too: the rays themselves have to be parallel, by the
-    # rotation alone. Without a base any will do, and then it is one that some wrong
-    # matches agree on: their parallaxes are no proof of it
+    # a large sigma0 may hide a base, therefore the rays themselves have to be parallel
+    # after the rotation. Without a base the engine finds one that some wrong matches
+    # agree on: their parallaxes do not prove it
     turns = lambda _, still: parallel(
         pair, rotation_only(*vectors(pair), use & still)[0], limit
     )
     still = lax.fori_loop(0, TURNS, turns, pair.mask)
     rotated = rotation_only(*vectors(pair), use & still)[0]
     few = count(use & ~still) <= ALIKE + CHANCE * count(pair.mask & ~still)
-    turned = ((result == RESULTS.zero_base) | few) & (
-        count(use & still) >= PLANE * count(use)
-    )
-    pose, use = jax.tree.map(
-        lambda a, b: jnp.where(turned, a, b), (rotated, still), (pose, use)
-    )
-    return pose, use, turned
+    most = count(use & still) >= PLANE * count(use)
+    turned = ((result == RESULTS.zero_base) | few) & most
+    choose = lambda a, b: jnp.where(turned, a, b)
+    return *jax.tree.map(choose, (rotated, still), (pose, use)), turned
 
 
 def certain(
     pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit: Float[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether so many matches, each counted once, do not agree by accident."""
+    """Whether so many different matches are not expected to agree by accident."""
     again, _ = evidence.repeats(pair)
     once = mask_unusable(pair.with_mask(pair.mask & ~again))[0]
     agreed, asked = evidence.shifted_agreement(once, pose, limit)
@@ -224,8 +216,9 @@ def certain(
 def sigma0(
     pair: Pair, pose: RelativePose, use: Bool[Array, "match"]
 ) -> Float[Array, ""]:
-    """The estimated standard deviation of unit weight, every match kept with its full
-    weight: that of the engine's own solution is too small where the weights fade."""
+    """The estimated standard deviation of unit weight, every kept match with its full
+    weight: the weights of the engine's solution fade, which makes its sigma0 too
+    small."""
     freedom = count(use) - 5
     square = total(jnp.where(use, squares(pair, pose), 0.0)) / jnp.maximum(freedom, 1.0)
     return jnp.where(freedom > 0, jnp.sqrt(square), 0.0)
