@@ -3,14 +3,12 @@ each other in one photo lie near each other in the other one.
 
     agreement of a point = Σ near(left) near(right) / Σ near(left)
 
-over other points, near(d²) = (c² / (c² + d²))², c = CLOSE mean distances.
+over other points, near(d²) = 1 / (1 + d² / c²)², c = CLOSE mean distances.
 """
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
-
-from .steps import geman_mcclure
 
 ENOUGH = 40
 """Points from which their neighbours say something."""
@@ -41,8 +39,8 @@ def order_by_neighbours(
         square = (others - point[None, :]) ** 2
         left = jnp.sum(square[:, :2], axis=1)
         right = jnp.sum(square[:, 2:], axis=1)
-        near = taken * geman_mcclure(left, near_left)
-        both = near * geman_mcclure(right, near_right)
+        near = taken / (1 + left / near_left) ** 2
+        both = near / (1 + right / near_right) ** 2
         neighbours = jnp.maximum(jnp.sum(near), 1e-6)
         return jnp.sum(both) / neighbours
 
@@ -58,5 +56,5 @@ def _spread(
     x, y = points.T
     n = jnp.maximum(jnp.sum(use), 1.0)
     mean = lambda a: jnp.sum(a * use) / n
-    variance = lambda a: mean(a * a) - mean(a) ** 2
-    return 4 * jnp.maximum(variance(x) + variance(y), 1e-12)
+    square = mean(x * x) - mean(x) ** 2 + mean(y * y) - mean(y) ** 2
+    return 4 * jnp.maximum(square, 1e-12)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ..adjustment.normal_equations import accumulate, solve
 from ..geometry.elements import RelativePose, vertical
@@ -48,8 +48,10 @@ def normal_equations(linear: Linear, weight: Values) -> tuple:
 
 def inner(one: Sequence[Values], other: Sequence[Values]) -> Values:
     """The scalar product of two vectors, of every point."""
-    products = [a * b for a, b in zip(one, other, strict=True)]
-    return sum(products[1:], products[0])
+    product = one[0] * other[0]
+    for a, b in zip(one[1:], other[1:], strict=True):
+        product = product + a * b
+    return product
 
 
 def improve(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
@@ -81,7 +83,7 @@ def step_by_weights(
     return take_step(pose, linear, linear.weight * weight(linear.squares))
 
 
-def geman_mcclure(squares: Values, variance: Array | float) -> Values:
+def geman_mcclure(squares: Values, variance: Float[Array, ""] | float) -> Values:
     """The weights of Geman and McClure (1985), (k² / (k² + s))², of squared residuals
     s; `variance` = k². They fall to a quarter at s = k²."""
     return (variance / (variance + squares)) ** 2
