@@ -24,6 +24,7 @@ from .adjustment import (
     adjust as adjust,
     critical_values as critical_values,
     losses as losses,
+    propagation as propagation,
 )
 from .assessment import (
     budget as budget,
@@ -31,7 +32,6 @@ from .assessment import (
     familywise as familywise,
     identification as identification,
     layout_design as layout_design,
-    propagation as propagation,
     reliability as reliability,
     sensitivity as sensitivity,
     variance_components as variance_components,

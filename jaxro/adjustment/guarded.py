@@ -15,6 +15,11 @@ def root(square: Array, there: Bool[Array, "..."] | bool = True) -> Array:
     return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
 
 
+def ratio(a: ArrayLike, b: ArrayLike, there: Bool[Array, "..."]) -> Array:
+    """a / b, zero where not `there`; with finite derivatives."""
+    return jnp.where(there, a / jnp.where(there, b, 1.0), 0.0)
+
+
 def times(values: ArrayLike, unit: ArrayLike) -> Array:
     """The product, NaN where the unit is, as sigma0 is without redundancy; with finite
     derivatives by the values."""

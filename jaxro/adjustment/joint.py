@@ -79,7 +79,7 @@ class Joint(eqx.Module):
     def __call__(self, steps: Steps) -> list[Array]:
         """The whitened (and, with a loss, transformed) residuals of every term."""
         found = [residuals(term, self.families, steps) for term in self.terms]
-        return found if self.loss is None else [self.loss.transformed(r) for r in found]
+        return found if self.loss is None else [self.loss.transform(r) for r in found]
 
     def correction(self, steps: Steps) -> Steps:
         """What Gauss-Newton subtracts from the displacements."""

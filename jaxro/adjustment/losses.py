@@ -1,14 +1,13 @@
-"""Robust losses rho(s) of the squared whitened residual s = r², each with rho(s) = s +
-O(s²) at zero.
+"""Robust losses rho(s) of the squared whitened residual s = r², and weights of
+iteratively reweighted least squares.
 
-A loss enters the adjustment as the transformed residual r sqrt(rho(r²)/r²), whose
-squares add up to the robust objective: optimum and implicit derivative are then both
-exact. The package's own solver reaches that optimum by steps with the weights rho'(r²)
-instead. `scale` is in units of the whitened residual, that is multiples of sigma, or mm
-where sigma is 1.
+An adjustment with a loss minimises Σ rho(r²). Each rho(s) is s + O(s²) at zero, so that
+small residuals count as in least squares. `scale` is in units of the whitened residual:
+multiples of sigma, or the unit of the coordinates if sigma is 1.
 
-Weights that belong to no loss in use serve the reweighting of `rejection.Reweighting`
-alone.
+A loss of your own subclasses `AbstractLoss` and defines `rho`; its weights and the
+transformed residuals follow from it. `AbstractWeight` is for weights that are the
+derivative of no loss in use; `rejection.Reweighting` takes these as well.
 """
 
 import abc
@@ -22,34 +21,38 @@ Values = Float[Array, "..."]
 
 
 class AbstractWeight(eqx.Module):
-    """The factor by which reweighted least squares multiplies the weight of an
-    observation."""
+    """A factor of the weight of an observation in iteratively reweighted least
+    squares."""
 
     @abc.abstractmethod
     def weight(self, s: Values) -> Values:
-        """The factor, 1 at zero, of squared whitened residuals."""
+        """The factor for squared whitened residuals s; 1 at zero."""
 
 
 class AbstractLoss(AbstractWeight):
-    """rho(s), and from it the weight rho'(s) of iteratively reweighted least
-    squares."""
+    """A loss rho(s); its weight is rho'(s)."""
 
     scale: eqx.AbstractVar[float]
 
     @abc.abstractmethod
     def rho(self, s: Values) -> Values:
-        """The loss of squared residuals."""
+        """The loss of squared whitened residuals."""
 
     def weight(self, s: Values) -> Values:
         """rho'(s), by autodiff."""
         return jax.jvp(self.rho, (s,), (jnp.ones_like(s),))[1]
 
-    def transformed(self, r: Values) -> Values:
-        """r sqrt(rho(r²)/r²), smooth through zero."""
+    def transform(self, r: Values) -> Values:
+        """r sqrt(rho(r²) / r²), smooth through zero.
+
+        The squares of these residuals add up to the robust objective, so that a
+        least-squares solver finds its optimum and implicit derivatives are exact.
+        """
         s = r * r
         tiny = s < 1e-16 * self.scale**2
         safe = jnp.where(tiny, self.scale**2, s)
-        return r * jnp.where(tiny, 1.0, jnp.sqrt(self.rho(safe) / safe))
+        factor = jnp.sqrt(self.rho(safe) / safe)
+        return r * jnp.where(tiny, 1.0, factor)
 
 
 class Huber(AbstractLoss):
@@ -60,9 +63,8 @@ class Huber(AbstractLoss):
     def rho(self, s):
         k2 = self.scale**2
         outside = s > k2
-        return jnp.where(
-            outside, 2 * self.scale * jnp.sqrt(jnp.where(outside, s, 1.0)) - k2, s
-        )
+        root = jnp.sqrt(jnp.where(outside, s, 1.0))
+        return jnp.where(outside, 2 * self.scale * root - k2, s)
 
 
 class SoftL1(AbstractLoss):
@@ -71,8 +73,9 @@ class SoftL1(AbstractLoss):
     scale: float = 1.0
 
     def rho(self, s):
-        # without a difference of nearly equal numbers
-        return 2 * s / (1 + jnp.sqrt(1 + s / self.scale**2))
+        # the same without a difference of nearly equal numbers
+        root = jnp.sqrt(1 + s / self.scale**2)
+        return 2 * s / (1 + root)
 
 
 class Cauchy(AbstractLoss):
@@ -104,7 +107,7 @@ class Tukey(AbstractLoss):
 
 
 class LeastAbsolute(AbstractWeight):
-    """k / sqrt(s) outside the scale k, 1 inside: Σ |r| = min, with a small k against
+    """k / sqrt(s) outside the scale k, 1 inside. It minimises Σ |r|; a small k avoids
     infinite weights."""
 
     scale: float = 0.1
@@ -115,18 +118,16 @@ class LeastAbsolute(AbstractWeight):
 
 class Danish(AbstractWeight):
     """1 inside the scale k, exp(-factor (sqrt(s)/k)^power) outside (Krarup, Juhl and
-    Kubik 1980; k = 2 or 3)."""
+    Kubik 1980, with k of 2 or 3)."""
 
     scale: float = 2.0
     factor: float = 0.05
     power: float = 3.0
 
     def weight(self, s):
-        return jnp.where(
-            s > self.scale**2,
-            jnp.exp(-self.factor * (s / self.scale**2) ** (self.power / 2)),
-            1.0,
-        )
+        k2 = self.scale**2
+        outside = jnp.exp(-self.factor * (s / k2) ** (self.power / 2))
+        return jnp.where(s > k2, outside, 1.0)
 
 
 class IggThree(AbstractWeight):
@@ -138,8 +139,5 @@ class IggThree(AbstractWeight):
 
     def weight(self, s):
         r = jnp.sqrt(jnp.maximum(s, self.scale**2))
-        return (
-            self.scale
-            / r
-            * (jnp.maximum(self.last - r, 0.0) / (self.last - self.scale)) ** 2
-        )
+        left = jnp.maximum(self.last - r, 0.0)
+        return self.scale / r * (left / (self.last - self.scale)) ** 2

@@ -1,34 +1,34 @@
-"""Standard deviation of unit weight, and spread of the parameters, of an adjustment
+"""Standard deviation of unit weight, and covariance of the parameters, of an adjustment
 with a robust loss.
 
 The loss acts on whitened residuals r of n conditions with p parameters; psi(r) = r
 rho'(r²) is its influence function.
 
-* sigma0 is consistent for normal errors: the tau with
+* sigma0 is consistent for normal errors: it is the tau with
 
       Σ rho(r²) / (n - p) = E rho(tau² z²),    z normal,
 
-  which is sqrt(Σ r² / (n - p)) for rho(s) = s. A bounded loss whose left side exceeds
-  all values of the right one gets the largest tau that is looked for.
+  which is sqrt(Σ r² / (n - p)) for rho(s) = s. If the left side exceeds all values of
+  the right side, as it may for a bounded loss, tau is the largest that is searched.
 * The covariance is C = v (AᵀA)⁻¹, A the whitened columns without the weights of the
-  loss. As observed (Huber 1981, eq. 6.1 of chapter 7, with one factor K, which fits a
-  dozen points better than two),
+  loss. One estimate of v comes from the residuals (Huber 1981, eq. 6.1 of chapter 7,
+  with one factor K in place of two, which fits a dozen points better),
 
       v1 = K [Σ psi² / (n - p)] / mean(psi')²,    K = 1 + p/n var(psi') / mean(psi')²,
 
-  and as expected of normal errors of the standard deviation sigma0,
+  another one from normal errors of the standard deviation sigma0,
 
       v2 = E psi² / (E psi')².
 
-  v1 stays right with wrong points. But few points know mean(psi') badly, and where psi'
-  is negative the minimum is one of several, chosen with a large mean(psi'). With c the
-  share of the negative part in Σ |psi'| and a = 1 / (K + 25 c)
+  v1 stays right with wrong points. But few points determine mean(psi') badly; and where
+  psi' is negative the minimum is one of several, chosen with a large mean(psi'). With c
+  the share of the negative part in Σ |psi'| and a = 1 / (K + 25 c)
 
       v = v1^a v2^(1-a),
 
-  so that many points and convex losses have v1, few points and redescending losses v2.
-  The exponent was found by simulation of 16 and 50 points; tests/test_losses.py has the
-  coverage.
+  so that v is near v1 for many points and convex losses, and near v2 for few points and
+  redescending losses. The exponent was found by simulation of 16 and 50 points;
+  tests/adjustment/test_losses.py has the coverage.
 """
 
 from typing import NamedTuple
@@ -40,6 +40,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..xla.passes import total
+from .bisection import bisect
 from .losses import AbstractLoss
 
 Scalar = Float[Array, ""]
@@ -48,7 +49,7 @@ NEGATIVE = 25.0
 """Weight of the share of negative psi' in the exponent."""
 
 LARGEST = 7.0
-"""log(sigma0 / sqrt(Σ rho / (n - p))) up to which sigma0 is looked for: a factor of a
+"""log(sigma0 / sqrt(Σ rho / (n - p))) up to which sigma0 is searched: a factor of a
 thousand."""
 
 HALVINGS = 48
@@ -61,54 +62,44 @@ DENSITY = 9.0 * _WEIGHTS * np.exp(-(Z**2) / 2) / np.sqrt(2 * np.pi)
 
 
 class Spread(NamedTuple):
-    """sigma0, and v / sigma0²: the factor of (AᵀA)⁻¹ that gives the cofactors of the
+    """`sigma0`, and the `factor` v / sigma0² of (AᵀA)⁻¹ that gives the cofactors of the
     parameters."""
 
     sigma0: Scalar
     factor: Scalar
 
 
-def influence(loss: AbstractLoss, r: Array) -> tuple[Array, Array]:
-    """psi(r) = r rho'(r²) and its derivative."""
-    return jax.jvp(lambda r: r * loss.weight(r * r), (r,), (jnp.ones_like(r),))
-
-
-def expected(values: Array) -> Scalar:
-    """E of an even function of a normal z from its values at `Z`."""
-    return total(values * jnp.asarray(DENSITY, values.dtype))
-
-
 def spread(
     loss: AbstractLoss, r: Float[Array, " entry"], use: Float[Array, " entry"], p: int
 ) -> Spread:
-    """`Spread` of residuals whitened without the loss, `use` 1 for those that count and
-    0 for others.
+    """`Spread` of residuals r whitened without the loss; `use` is 1 for those that
+    count and 0 for others.
 
     Both numbers are finite, but mean nothing, without redundancy.
     """
     n = total(use)
     freedom = jnp.maximum(n - p, 1.0)
-    psi, slope = influence(loss, r)
     sigma0 = scale(loss, total(use * loss.rho(r * r)) / freedom)
+
+    psi, slope = influence(loss, r)
     mean = total(use * slope) / n
     variance = total(use * (slope - mean) ** 2) / n
     square = jnp.maximum(mean * mean, jnp.finfo(r.dtype).eps)
     k = 1 + p / n * variance / square
-    negative = total(use * jnp.maximum(-slope, 0.0)) / total(use * jnp.abs(slope))
     observed = k * total(use * psi * psi) / freedom / square
-    z = sigma0 * jnp.asarray(Z, r.dtype)
-    weight = loss.weight(z * z)
-    # E psi'(tau z) = E z psi(tau z) / tau, positive for every loss
-    normal = (
-        expected((weight * z) ** 2) / expected(weight * jnp.asarray(Z**2, r.dtype)) ** 2
-    )
+
+    size = total(use * jnp.abs(slope))
+    negative = total(use * jnp.maximum(-slope, 0.0)) / size
     part = 1 / (k + NEGATIVE * negative)
     tiny = jnp.finfo(r.dtype).tiny ** 0.5
-    v = jnp.exp(
-        part * jnp.log(jnp.maximum(observed, tiny))
-        + (1 - part) * jnp.log(jnp.maximum(normal, tiny))
-    )
-    return Spread(sigma0, v / jnp.maximum(sigma0 * sigma0, tiny))
+    logarithm = lambda v: jnp.log(jnp.maximum(v, tiny))
+    both = part * logarithm(observed) + (1 - part) * logarithm(_normal(loss, sigma0))
+    return Spread(sigma0, jnp.exp(both) / jnp.maximum(sigma0 * sigma0, tiny))
+
+
+def influence(loss: AbstractLoss, r: Array) -> tuple[Array, Array]:
+    """psi(r) = r rho'(r²) and its derivative."""
+    return jax.jvp(lambda r: r * loss.weight(r * r), (r,), (jnp.ones_like(r),))
 
 
 def scale(loss: AbstractLoss, mean: Scalar) -> Scalar:
@@ -117,30 +108,30 @@ def scale(loss: AbstractLoss, mean: Scalar) -> Scalar:
     tiny = jnp.finfo(mean.dtype).tiny ** 0.5
     least = 0.5 * jnp.log(jnp.maximum(mean, tiny))  # rho(s) <= s
 
-    def of(log_tau):
+    def expected_rho(log_tau):
         z = jnp.exp(log_tau) * jnp.asarray(Z, mean.dtype)
-        return expected(loss.rho(z * z))
+        return expectation(loss.rho(z * z))
 
-    there = mean < of(least + LARGEST)
-    mean = jnp.where(there, mean, of(lax.stop_gradient(least)))
-
-    def excess(log_tau):
-        return jnp.log(jnp.maximum(of(log_tau), tiny)) - jnp.log(
-            jnp.maximum(mean, tiny)
-        )
-
-    def bisected(excess, low):
-        def halved(_, interval):
-            low, high = interval
-            middle = (low + high) / 2
-            below = excess(middle) < 0
-            return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
-        low, high = lax.fori_loop(0, HALVINGS, halved, (low, low + LARGEST))
-        return (low + high) / 2
-
-    guess = lax.stop_gradient(least)
-    root = lax.custom_root(
-        excess, guess, bisected, lambda slope, y: y / slope(jnp.ones_like(y))
+    there = mean < expected_rho(least + LARGEST)
+    mean = jnp.where(there, mean, expected_rho(lax.stop_gradient(least)))
+    logarithm = lambda x: jnp.log(jnp.maximum(x, tiny))
+    excess = lambda log_tau: logarithm(expected_rho(log_tau)) - logarithm(mean)
+    solve = lambda excess, low: bisect(
+        lambda x: ~(excess(x) < 0), low, low + LARGEST, HALVINGS
     )
+    solve_tangent = lambda slope, y: y / slope(jnp.ones_like(y))
+    root = lax.custom_root(excess, lax.stop_gradient(least), solve, solve_tangent)
     return jnp.exp(jnp.where(there, root, least + LARGEST))
+
+
+def expectation(values: Array) -> Scalar:
+    """E of an even function of a normal z from its values at `Z`."""
+    return total(values * jnp.asarray(DENSITY, values.dtype))
+
+
+def _normal(loss: AbstractLoss, sigma0: Scalar) -> Scalar:
+    """v2; E psi'(tau z) = E z psi(tau z) / tau is positive for every loss."""
+    z = sigma0 * jnp.asarray(Z, sigma0.dtype)
+    weight = loss.weight(z * z)
+    slope = expectation(weight * jnp.asarray(Z**2, sigma0.dtype))
+    return expectation((weight * z) ** 2) / slope**2

@@ -66,7 +66,7 @@ class Residuals(eqx.Module):
     def residuals(self, g: list, d: list, use) -> list:
         """The m whitened (and, with a loss, transformed) residuals of one group."""
         r = whiten(g, d, use)
-        return r if self.loss is None else [self.loss.transformed(entry) for entry in r]
+        return r if self.loss is None else [self.loss.transform(entry) for entry in r]
 
     def __call__(
         self, x: tuple[Array, ...]

@@ -1,7 +1,26 @@
-"""What an oriented pair is worth: assessment beyond its residuals."""
+"""Assessment of an oriented pair: how much its results can be trusted.
+
+Everything is computed from the conditions linearised at the solution
+(`geometry.linear.linearise`).
+
+    reliability            tests of single points, detectable errors and their effects
+      internal_            redundancy numbers, w, sizes of detectable errors
+      external_            effects of errors on elements, heights and m_q
+    correlations           which points the tests can tell apart
+      familywise           critical values of the largest |w| or |tau| of a pair
+      undecided            points that explain a misfit equally well
+      identification       errors that are attributed to the right point
+    neighbours             test of correlation between the errors of neighbouring points
+      correlated           accuracy of the elements under such correlation
+    variance_components    standard deviations of groups, from many pairs
+    sensitivity            derivatives of results by the measurements, influence of points
+      budget               variance of a result by sources of error
+    layout_design          positions of points that minimise a criterion
+      layout_criteria      the criteria
+"""
 
 from .correlated import (
     Correlated as Correlated,
     correlated_covariance as correlated_covariance,
 )
-from .neighbours import Pattern as Pattern, pattern as pattern, pooled as pooled
+from .neighbours import Pattern as Pattern, pattern as pattern, pool as pool

@@ -1,26 +1,27 @@
 """Critical values of the largest |w| and the largest |tau| of a pair, from their
 correlations.
 
-The level is the probability that any point of an errorless pair is rejected. Shared out
-equally by Bonferroni or Šidák it is kept only where the w are independent: of 6, 7, 8
-and 12 points in the standard zones a nominal 5 % are in truth 0.9, 1.8, 2.5 and 4.3 %,
-as six points have but one w among them.
+The level is the probability that any point of an errorless pair is rejected. The shares
+of Bonferroni or Šidák keep it only where the w are independent: of 6, 7, 8 and 12
+points in the standard zones a nominal 5 % are in truth 0.9, 1.8, 2.5 and 4.3 %, as six
+points have but one w among them.
 
-Let A_i be the event |w_i| > c and N the number of them that happen together. Then
+Let A_i be the event |w_i| > c, and N the number of these events that happen together.
+Then
 
     P(any A_i) = Σ P(A_i) E[1/N | A_i] = P(A_1) m,    m = Σ E[1/N | A_i]
 
-(Naiman and Wynn 1997). m is the effective number of tests: 1 where all are the same, n
-where no two happen together. The expectation is a mean over `DRAWS` fixed draws, each
-for one point i in turn: w_i is drawn beyond c, the others given it. As 1/N lies between
-1/n and 1 the mean has a small variance however rare the event is. The value of c is
-that of one test at the level over m, with m taken at a first c of n tests and once
-more.
+(Naiman and Wynn 1997). m is the effective number of tests: 1 if all events are the
+same, n if no two happen together. The expectation is a mean over `DRAWS` fixed draws,
+each for one point i in turn: w_i is drawn beyond c, and the other w given w_i. As 1/N
+lies between 1/n and 1, the mean has a small variance however rare the event is. c is
+the critical value of one test at the level over m, with m found at the value of n tests
+first and then once more.
 
-Measured on layouts of 6 to 50 points: nominal 5 % are within 0.15 % and nominal 0.25 %
-within 0.02 %. Pairs of more than `MOST` points have Šidák's value, from which theirs
-differs by less than that unless most points stand in one place. The draws are assigned
-to the tested points in their order: masked points change nothing.
+In layouts of 6 to 50 points the true probability is within 0.15 % of a nominal 5 % and
+within 0.02 % of a nominal 0.25 %. Pairs of more than `MOST` points have the value of
+Šidák; the difference is smaller than that, unless most points lie in one place. The
+draws belong to the tested points in their order, so that masked points change nothing.
 """
 
 from collections.abc import Callable
@@ -35,23 +36,23 @@ from ..xla.kernels import computed_once, while_loop
 from .correlations import Normalised
 
 DRAWS = 1024
-"""Draws of the table: the effective number is right to about 1 %."""
+"""Fixed draws: the effective number is right to about 1 %."""
 
 MOST = 64
 """Tested points up to which the effective number is found."""
 
 TURNS = 2
-"""Evaluations of the effective number, which depends little on the value it is taken
-at."""
+"""Evaluations of the effective number. It depends little on the critical value at which
+it is evaluated."""
 
 KNOTS = 24
-"""Effective numbers for which the critical value of tau is tabulated, between 1 and
-MOST in equal ratios."""
+"""Effective numbers for which the critical value of tau is tabulated, from 1 to MOST in
+equal ratios."""
 
 
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Normal numbers (point, draw) and numbers with the density exp(-x) (draw), which
-    are spread evenly."""
+    """Normal numbers (point, draw), and evenly spread numbers (draw) of the density
+    exp(-x)."""
     random = np.random.default_rng(1968)
     normal = random.normal(size=(MOST, DRAWS))
     even = (np.arange(DRAWS) + 0.5) / DRAWS
@@ -70,115 +71,113 @@ def largest_w(level: ArrayLike, normalised: Normalised) -> Float[Array, ""]:
         normalised.w.shape[0],
         _count(normalised),
     )
-    return _largest(value, beyond, normalised, _drawn_w)
+    return _largest(value, beyond, normalised, _draw_w)
 
 
 def largest_tau(level: ArrayLike, normalised: Normalised) -> Float[Array, ""]:
-    """The same of the largest |tau|: sigma0 is estimated. Infinite with one degree of
-    freedom, where every |tau| is 1.
-
-    The level of one test is the tail of the tau distribution, P(tau² / f > x) of a beta
-    distribution.
-    """
-    points = normalised.w.shape[0]
+    """The value that the largest |tau| of an errorless pair exceeds with probability
+    `level`; sigma0 is estimated. Infinite with one degree of freedom, where every |tau|
+    is 1."""
+    most, points = normalised.w.shape[0], normalised.freedom + 5
     freedom = lambda n: jnp.maximum(n - 5, 1.0)
+    beyond = critical.by_count(
+        lambda n: critical.tau(critical.sidak(level, n), freedom(n)), most, points
+    )
     with jax.ensure_compile_time_eval():
         number = jnp.asarray(MOST ** (np.arange(KNOTS) / (KNOTS - 1)))
-        n = jnp.arange(min(points, MOST) + 1.0)
-        table = critical.tau(
-            jnp.asarray(level, float) / number[None, :], freedom(n)[:, None]
-        )
-    own = jnp.arange(table.shape[0]) == (normalised.freedom + 5).astype(int)
-    row = jnp.sum(jnp.where(own[:, None] & (n > 6)[:, None], table, 0.0), axis=0)
+        n = jnp.arange(min(most, MOST) + 1.0)
+        levels = jnp.asarray(level, float) / number[None, :]
+        table = critical.tau(levels, freedom(n)[:, None])
+    own = jnp.arange(n.size) == points.astype(int)
+    own = own & (n > 6)
+    row = jnp.sum(jnp.where(own[:, None], table, 0.0), axis=0)
     value = lambda number: _cubic(row, jnp.log(number) / np.log(MOST) * (KNOTS - 1))
-    beyond = critical.by_count(
-        lambda n: critical.tau(critical.sidak(level, n), freedom(n)),
-        points,
-        normalised.freedom + 5,
-    )
-    found = _largest(value, beyond, normalised, _drawn_tau)
+    found = _largest(value, beyond, normalised, _draw_tau)
     return jnp.where(normalised.freedom > 1, found, jnp.inf)
 
 
 def effective_number(
     normalised: Normalised, limit: ArrayLike, estimated: bool = False
 ) -> Float[Array, ""]:
-    """How many independent tests reject as often as those of the tested points of a
-    pair, each at |w| = limit (|tau| if `estimated`); of at most MOST points."""
-    drawn = _drawn_tau if estimated else _drawn_w
-    return _number(_few(normalised), jnp.asarray(limit, float), drawn)
+    """The number of independent tests that reject as often as the tests of the points
+    of a pair, each at |w| = limit (|tau| if sigma0 is `estimated`); for at most MOST
+    points."""
+    draw = _draw_tau if estimated else _draw_w
+    return _number(_few(normalised), jnp.asarray(limit, float), draw)
 
 
 def _largest(
-    value: Callable, beyond: Array, normalised: Normalised, drawn: Callable
+    value: Callable, beyond: Array, normalised: Normalised, draw: Callable
 ) -> Float[Array, ""]:
-    def found(normalised: Normalised) -> Float[Array, ""]:
+    """value(m) at the effective number m; `beyond` for pairs of more than MOST
+    points."""
+
+    def find(normalised: Normalised) -> Float[Array, ""]:
         few = _few(normalised)
         number, at = jnp.maximum(_count(few), 1.0), computed_once(value)
         for _ in range(TURNS):
-            number = _number(few, at(number), drawn)
+            number = _number(few, at(number), draw)
         return at(number)
 
     if normalised.w.shape[0] <= MOST:
-        return found(normalised)
-    needed = _count(normalised) <= MOST
+        return find(normalised)
 
-    def once(
-        state,
-        # a loop of at most one round: under vmap it is entered only if some pair needs it
-    ):
+    # a loop of at most one round: under vmap it is entered only if some pair needs it
+    def once(state):
         needed, _ = state
         tested = normalised.tested & needed
-        return needed & False, jnp.where(
-            needed, found(normalised._replace(tested=tested)), beyond
-        )
+        found = find(normalised._replace(tested=tested))
+        return needed & False, jnp.where(needed, found, beyond)
 
-    return while_loop(
-        lambda state: state[0], once, (needed, beyond), normalised.squares
-    )[1]
+    start = _count(normalised) <= MOST, beyond
+    return while_loop(lambda state: state[0], once, start, normalised.squares)[1]
 
 
-def _number(few: Normalised, limit: Array, drawn: Callable) -> Float[Array, ""]:
+def _number(few: Normalised, limit: Array, draw: Callable) -> Float[Array, ""]:
     """Σ E[1/N | A_i] by the draws: draw k is for the tested point k modulo their
     number."""
     n, places = _count(few), few.w.shape[0]
-    root = jnp.sqrt(jnp.where(few.tested, few.redundancy, 1.0))
+    number, point = jnp.maximum(n, 1.0), jnp.arange(DRAWS)
+    own = point % number.astype(int)
     used = jnp.where(few.tested, 1.0, 0.0)
-    point = jnp.arange(DRAWS) % jnp.maximum(n, 1.0).astype(int)
+    root = jnp.sqrt(jnp.where(few.tested, few.redundancy, 1.0))
     errors = jnp.asarray(NORMAL[:places])
     along = (few.basis * root[:, None]).T @ errors
-    of_own = few.basis[point].T
-    own_error = jnp.asarray(NORMAL.T)[jnp.arange(DRAWS), point]
-    w = own_error / root[point] - jnp.sum(of_own * along, axis=0)
+    basis = few.basis[own].T
+    w = jnp.asarray(NORMAL.T)[point, own] / root[own] - jnp.sum(basis * along, axis=0)
     inside = used @ errors**2 - jnp.sum(along**2, axis=0)
-    at, threshold, weight = drawn(limit, w, inside, few.freedom)
-    # given that the own w is `at`, those of the others are moved by their correlation
-    # times the difference
-    moved = along + of_own * (at - w)[None, :]
+    at, threshold, weight = draw(limit, w, inside, few.freedom)
+
+    # given that the own w is `at`, the other w move by their correlation times the
+    # difference
+    moved = along + basis * (at - w)[None, :]
     others = errors * (used / root)[:, None] - few.basis @ moved
     happen = jnp.abs(others) > threshold[None, :]
     # the own event, which happens, is counted apart: rounding may not decide
-    own = jnp.arange(places)[:, None] == point[None, :]
-    together = 1 + jnp.sum(jnp.where(happen & ~own, 1.0, 0.0), axis=0)
-    return jnp.maximum(n, 1.0) * jnp.sum(weight / together) / jnp.sum(weight)
+    happen = happen & (jnp.arange(places)[:, None] != own[None, :])
+    together = 1 + jnp.sum(jnp.where(happen, 1.0, 0.0), axis=0)
+    return number * jnp.sum(weight / together) / jnp.sum(weight)
 
 
-def _drawn_w(
+def _draw_w(
     limit: Array, w: Array, inside: Array, freedom: Array
 ) -> tuple[Array, Array, Array]:
-    """w beyond the limit: w² / 2 exceeds limit² / 2 by an exponential number, with
-    weights 1 / w."""
+    """w beyond the limit, the threshold of the other |w|, and the weights of the draws:
+    w² / 2 exceeds limit² / 2 by an exponential number, with weights 1 / w."""
     at = jnp.sqrt(limit**2 + 2 * EXPONENTIAL)
     return at, jnp.broadcast_to(limit, at.shape), 1 / at
 
 
-def _drawn_tau(
+def _draw_tau(
     limit: Array, w: Array, inside: Array, freedom: Array
 ) -> tuple[Array, Array, Array]:
-    """tau beyond the limit. x = tau / sqrt(f) has the density (1 - x²)^((f - 3) / 2): 1
-    - x² is that of the limit times u^(2 / (f - 1)), u uniform, with weights 1 / x. What
-    is orthogonal to w keeps its length, so that the draw is the w, and the threshold
-    the multiple of it, that have this x beside that length."""
+    """w with tau beyond the limit, the threshold of the other |w|, and the weights.
+
+    x = tau / sqrt(f) has the density (1 - x²)^((f - 3) / 2): 1 - x² is its value at the
+    limit times u^(2 / (f - 1)), u uniform, with weights 1 / x. The part of the errors
+    that is orthogonal to w keeps its length (`inside` is Σ r²); the draw is the w that
+    has this x beside that length.
+    """
     f = jnp.maximum(freedom, 2.0)
     left = jnp.maximum(1 - limit**2 / f, 1e-12)
     across = left * jnp.exp(-2 * EXPONENTIAL / (f - 1))
@@ -189,19 +188,20 @@ def _drawn_tau(
 
 def _few(normalised: Normalised) -> Normalised:
     """The tested points one behind the other, in at most MOST places."""
-    places = min(normalised.w.shape[0], MOST)
+    points = normalised.w.shape[0]
+    places = min(points, MOST)
     rank = jnp.cumsum(normalised.tested.astype(int)) - 1
-    rank = jnp.where(normalised.tested, rank, normalised.w.shape[0])
-    packed = lambda values: (
-        jnp.zeros((places, *values.shape[1:]), values.dtype)
-        .at[rank]
-        .set(values, mode="drop")
-    )
+    rank = jnp.where(normalised.tested, rank, points)
+
+    def pack(values: Array) -> Array:
+        empty = jnp.zeros((places, *values.shape[1:]), values.dtype)
+        return empty.at[rank].set(values, mode="drop")
+
     return normalised._replace(
-        w=packed(normalised.w),
-        basis=packed(normalised.basis),
-        redundancy=packed(normalised.redundancy),
-        tested=packed(normalised.tested),
+        w=pack(normalised.w),
+        basis=pack(normalised.basis),
+        redundancy=pack(normalised.redundancy),
+        tested=pack(normalised.tested),
     )
 
 
@@ -215,10 +215,10 @@ def _cubic(row: Float[Array, "knot"], place: Array) -> Array:
     first = jnp.clip(jnp.floor(place) - 1, 0.0, KNOTS - 4.0)
     value = place * 0
     for k in range(4):
-        others = [j for j in range(4) if j != k]
         factor = place * 0 + 1
-        for j in others:
-            factor = factor * (place - first - j) / (k - j)
+        for j in range(4):
+            if j != k:
+                factor = factor * (place - first - j) / (k - j)
         here = jnp.arange(KNOTS) == (first + k).astype(int)
         value = value + factor * jnp.sum(jnp.where(here, row, 0.0))
     return value

@@ -1,23 +1,27 @@
-"""Identification: not only that an error is found, but in which point.
+"""Identification: how large an error must be to be attributed to its own point.
 
 An error that moves w_i by delta moves the w of the other points by rho_ij delta. Point
-i is *identified* by a test if it is the one point that is named
-(`rejection.undecided`): |w_i| exceeds the limit, no other |w| is larger, and no other
-point explains the misfit as well. With x = w_i and v_j normal, independent of x, w_j =
-rho x + sqrt(1 - rho²) v_j, so that for a positive error all of this is
+i is *identified* by a test if it is the only point that is named (see `undecided`):
+|w_i| exceeds the limit, no other |w| is larger, and no other point explains the misfit
+as well. With x = w_i and v_j normal, independent of x, w_j = rho x + sqrt(1 - rho²)
+v_j, so that for a positive error all of this is
 
     x > limit,    x > sqrt((1 + rho) / (1 - rho)) v_j,    x > -sqrt((1 - rho) / (1 + rho)) v_j,
     x > (k + rho v_j) / sqrt(1 - rho²),
 
 k the normal value of `doubt`. With X the largest right-hand side, P(i is identified) is
-the mean of Φ(delta - X) over the v. The *minimal identifiable error* is that of which
-the mean is the wanted power, as the minimal detectable error (Baarda 1968) is that of
-which P(|w_i| > limit) is. With doubt = 1 it is the minimal identifiable bias of the
-largest |w| (Teunissen 2018; Rofatto et al. 2020). It is infinite where |rho| = 1.
+the mean of Φ(delta - X) over the v. The *minimal identifiable error* is the delta for
+which this mean is the wanted power, as the minimal detectable error (Baarda 1968) is
+the delta for which P(|w_i| > limit) is. With doubt = 1 it is the minimal identifiable
+bias of the largest |w| (Teunissen 2018; Rofatto et al. 2020). It is infinite where
+|rho| = 1.
 
-All is of first order, at the measured coordinates, with a known sigma0. What depends on
-several residuals at once is simulated from a key, with the same draws for all points.
+Everything is of first order, at the measured coordinates, with a known sigma0.
+Probabilities that depend on several residuals are simulated from a key, with the same
+draws for all points.
 """
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,14 +31,13 @@ from jax.scipy.special import ndtr
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from ..adjustment import critical_values as critical
-from ..geometry.linear import linearised
+from ..adjustment.bisection import bisect
+from ..geometry.linear import Linear, Values, linearise
 from ..geometry.pairs import Coordinates, Pair, mask_unusable
-from ..orientation.result import Orientation
-from .correlations import Normalised, normalised
+from ..orientation.orient import Orientation
+from .correlations import Normalised, normalise
 from .familywise import largest_w
-from .undecided import DOUBT, explaining
-
-PerPoint = Float[Array, "point"]
+from .undecided import DOUBT, explanations
 
 HALVINGS = 50
 """Of the interval in which the size of an error is sought."""
@@ -44,45 +47,46 @@ SAME = 1e-6
 
 
 class Identification(eqx.Module):
-    """Which errors of a pair could be found, and which attributed to their point; zero
-    or False where masked.
+    """The smallest errors of a pair that would be found, and those that would be
+    attributed to their point; zero or False where masked.
 
     `tested`: points that others check. `partner`: the point with which a point is
-    confused most easily, that of the largest |rho|, and this `correlation`, with its
-    sign. `limit`: of |w|. Sizes of errors in units of the standard deviation of w:
-    `found` with the power wanted in the point itself, and `identified` with it.
-    `detectable` and `identifiable`: the same errors of the coordinates (x_left, y_left,
-    x_right, y_right) in their unit; infinite where an error shows nowhere, or has no
-    size at which it is attributed to its point.
+    confused most easily, the one with the largest |rho|; `correlation`: this rho.
+    `limit` of |w|. Two sizes of errors in standard deviations of w: an error in a point
+    makes its |w| exceed the limit with the wanted power if it is `found` large, and is
+    identified with this power if it is `identified` large. `detectable` and
+    `identifiable`: the same errors of the coordinates (x_left, y_left, x_right,
+    y_right) in their unit; infinite where an error does not show, or is never
+    attributed to its point.
     """
 
     tested: Bool[Array, "point"]
     partner: Int[Array, "point"]
-    correlation: PerPoint
+    correlation: Values
     limit: Float[Array, ""]
     found: Float[Array, ""]
-    identified: PerPoint
+    identified: Values
     detectable: Coordinates
     identifiable: Coordinates
 
 
 class Chances(eqx.Module):
-    """Of an error in each point: how often it is attributed to its point (`correct`),
-    to another one (`wrong`), to several of which it is one (`undecided`) or not one
-    (`misled`), or nothing is found (`missed`). They add up to 1; zero where a point is
-    not tested."""
+    """Probabilities of what becomes of an error in each point: one point is named, the
+    right one (`correct`) or another one (`wrong`); several points are named, the right
+    one among them (`undecided`) or not (`misled`); or none is named (`missed`). They
+    add up to 1; zero where a point is not tested."""
 
-    correct: PerPoint
-    wrong: PerPoint
-    undecided: PerPoint
-    misled: PerPoint
-    missed: PerPoint
+    correct: Values
+    wrong: Values
+    undecided: Values
+    misled: Values
+    missed: Values
 
 
 def correlations(pair: Pair, orientation: Orientation) -> Float[Array, "point point"]:
     """Correlations of the w of all points of one pair; zero where a point is masked or
     not checked by others."""
-    return _normalised(pair, orientation)[1].matrix()
+    return _read(pair, orientation).known.matrix()
 
 
 def identify(
@@ -97,57 +101,38 @@ def identify(
     doubt: float = DOUBT,
     draws: int = 4096,
 ) -> Identification:
-    """The minimal detectable beside the minimal identifiable errors of one pair at its
+    """The minimal detectable and the minimal identifiable errors of one pair at its
     orientation.
 
     `sigma0`: the standard deviation of unit weight: 1 where pair.sigma are the standard
     deviations. `level` of the test of each point, or (`familywise`) of all together.
-    `doubt`: of the points that are named together, 1 if the largest |w| alone decides.
-    `draws` of all residuals: with 4,096 the power of the identifiable errors is right
-    to 0.005; the work is draws × points². Under jit and vmap the options but sigma0 and
-    the key are static.
+    `doubt` as in `undecided`: 1 if the largest |w| alone decides. `draws` of all
+    residuals: with 4,096 the power of the identifiable errors is right to 0.005; the
+    work is draws × points². Under jit and vmap the options but sigma0 and the key are
+    static.
     """
-    pair, known = _normalised(pair, orientation)
+    pair, linear, known = _read(pair, orientation)
     limit = _limit(known, level, familywise)
     found = critical.delta_normal(2 * ndtr(-limit), power)
-    errors = _errors(known, key, draws)
+    errors = _draw_errors(known, key, draws)
     correlation, partner = _partners(known)
 
     def size(point: Int[Array, ""]) -> Float[Array, ""]:
         least, able = _least(known, errors, point, limit, doubt)
         return _size(least, jnp.asarray(power, float), able)
 
-    identified = lax.map(size, jnp.arange(known.w.shape[0]))
-    linear = linearised(pair, orientation.pose)
-
-    def of_coordinates(delta: PerPoint) -> Coordinates:
-        """delta sigma0 sigma / sqrt(r_k), r_k = r B_k² Q_k / D the redundancy number of
-        the coordinate."""
-
-        def one(b: PerPoint) -> PerPoint:
-            part = b**2 * pair.sigma**2 * linear.weight * known.redundancy
-            seen = known.tested & (part > SAME)
-            size = (
-                delta
-                * jnp.asarray(sigma0)
-                * pair.sigma
-                / jnp.sqrt(jnp.where(seen, part, 1.0))
-            )
-            return jnp.where(pair.mask, jnp.where(seen, size, jnp.inf), 0.0)
-
-        return tuple(one(b) for b in linear.gradient)
-
+    sizes = lax.map(size, jnp.arange(known.w.shape[0]))
+    identified = jnp.where(known.tested, sizes, jnp.inf)
+    per_coordinate = lambda delta: _of_coordinates(pair, linear, known, delta, sigma0)
     return Identification(
         tested=known.tested,
         partner=partner,
         correlation=correlation,
         limit=limit,
         found=found,
-        identified=jnp.where(
-            known.tested, identified, jnp.where(pair.mask, jnp.inf, 0.0)
-        ),
-        detectable=of_coordinates(jnp.full_like(known.w, 1.0) * found),
-        identifiable=of_coordinates(jnp.where(known.tested, identified, 1.0)),
+        identified=jnp.where(pair.mask, identified, 0.0),
+        detectable=per_coordinate(jnp.ones_like(known.w) * found),
+        identifiable=per_coordinate(jnp.where(known.tested, sizes, 1.0)),
     )
 
 
@@ -170,87 +155,107 @@ def chances(
     `size`: in the unit of the coordinates, one or one per point, of the `coordinate` (0
     to 3: x_left, y_left, x_right, y_right). Other arguments as of `identify`.
     """
-    pair, known = _normalised(pair, orientation)
-    linear = linearised(pair, orientation.pose)
+    _, linear, known = _read(pair, orientation)
     limit = _limit(known, level, familywise)
-    jump = linear.gradient[coordinate] * jnp.broadcast_to(
-        jnp.asarray(size, float), known.w.shape
-    )
-    delta = jump * jnp.sqrt(linear.weight * known.redundancy) / jnp.asarray(sigma0)
-    errors = _errors(known, key, draws)
+    size = jnp.broadcast_to(jnp.asarray(size, float), known.w.shape)
+    root = jnp.sqrt(linear.weight * known.redundancy)
+    delta = linear.gradient[coordinate] * size * root / jnp.asarray(sigma0)
+    errors = _draw_errors(known, key, draws)
 
-    def one(point: Int[Array, ""]) -> tuple[Float[Array, ""], ...]:
+    def with_error(point: Int[Array, ""]) -> Chances:
         own = jnp.arange(known.w.shape[0]) == point
         shift = known.row(point) * jnp.sum(jnp.where(own, delta, 0.0))
-
-        def outcome(w: PerPoint) -> tuple[Bool[Array, ""], ...]:
-            w = w + shift
-            largest = jnp.argmax(jnp.abs(w))
-            named = explaining(known._replace(w=w), largest, doubt)
-            found = jnp.max(jnp.abs(w)) > limit
-            alone, among = jnp.sum(named) == 1, jnp.any(named & own)
-            right, several, other = (
-                found & alone & among,
-                found & ~alone & among,
-                found & ~among,
-            )
-            return right, other & alone, several, other & ~alone, ~found
-
+        outcomes = jax.vmap(lambda w: _judge(known, w + shift, own, limit, doubt))
         tested = jnp.any(own & known.tested)
-        share = lambda happened: jnp.where(
-            tested, jnp.mean(happened.astype(float)), 0.0
+        share = lambda happened: jnp.mean(happened.astype(float))
+        return jax.tree.map(
+            lambda happened: jnp.where(tested, share(happened), 0.0), outcomes(errors)
         )
-        return jax.tree.map(share, jax.vmap(outcome)(errors))
 
-    correct, wrong, undecided, misled, missed = lax.map(
-        one, jnp.arange(known.w.shape[0])
-    )
+    return lax.map(with_error, jnp.arange(known.w.shape[0]))
+
+
+def _judge(
+    known: Normalised, w: Values, own: Bool[Array, "point"], limit: Array, doubt: float
+) -> Chances:
+    """What a test of these w names, given that the error is in the `own` point: exactly
+    one field is True."""
+    size = jnp.abs(w)
+    named = explanations(known._replace(w=w), jnp.argmax(size), doubt)
+    found = jnp.max(size) > limit
+    alone, among = jnp.sum(named) == 1, jnp.any(named & own)
     return Chances(
-        correct=correct, wrong=wrong, undecided=undecided, misled=misled, missed=missed
+        correct=found & among & alone,
+        wrong=found & ~among & alone,
+        undecided=found & among & ~alone,
+        misled=found & ~among & ~alone,
+        missed=~found,
     )
 
 
-def _normalised(pair: Pair, orientation: Orientation) -> tuple[Pair, Normalised]:
+class _Read(NamedTuple):
+    pair: Pair
+    linear: Linear
+    known: Normalised
+
+
+def _read(pair: Pair, orientation: Orientation) -> _Read:
+    """The cleaned pair, its conditions at the orientation, and its normalised
+    residuals."""
     if pair.x_left.ndim != 1:
         raise ValueError(
             f"one pair is wanted, but the coordinates have shape {pair.x_left.shape}: "
             "use jax.vmap"
         )
     pair, _ = mask_unusable(pair)
-    return pair, normalised(
-        linearised(pair, orientation.pose), pair.mask & orientation.usable
-    )
+    linear = linearise(pair, orientation.pose)
+    return _Read(pair, linear, normalise(linear, pair.mask & orientation.usable))
 
 
 def _limit(known: Normalised, level: float, familywise: bool) -> Float[Array, ""]:
-    return (
-        largest_w(level, known)
-        if familywise
-        else critical.normal(level) + 0 * known.squares
-    )
+    if familywise:
+        return largest_w(level, known)
+    return critical.normal(level) + 0 * known.squares
 
 
-def _errors(
+def _draw_errors(
     known: Normalised, key: PRNGKeyArray, draws: int
 ) -> Float[Array, "draw point"]:
     """The w of errorless pairs."""
     root = jnp.sqrt(jnp.where(known.tested, known.redundancy, 1.0))
     noise = jax.random.normal(key, (draws, known.w.shape[0]), float)
     along = noise @ (known.basis * root[:, None])
-    return jnp.where(
-        known.tested[None, :], noise / root[None, :] - along @ known.basis.T, 0.0
-    )
+    w = noise / root[None, :] - along @ known.basis.T
+    return jnp.where(known.tested[None, :], w, 0.0)
 
 
-def _partners(known: Normalised) -> tuple[PerPoint, Int[Array, "point"]]:
-    """The correlation largest in size of each point with another, and that other."""
+def _of_coordinates(
+    pair: Pair, linear: Linear, known: Normalised, delta: Values, sigma0: ArrayLike
+) -> Coordinates:
+    """Errors of the coordinates that move w by delta: delta sigma0 sigma / sqrt(r_k),
+    r_k = r B_k² Q_k / D the redundancy number of the coordinate."""
 
-    def one(point: Int[Array, ""]):
-        rho = jnp.where(jnp.arange(known.w.shape[0]) == point, 0.0, known.row(point))
+    def size(b: Values) -> Values:
+        part = b**2 * pair.sigma**2 * linear.weight * known.redundancy
+        seen = known.tested & (part > critical.UNTESTABLE)
+        root = jnp.sqrt(jnp.where(seen, part, 1.0))
+        error = delta * jnp.asarray(sigma0) * pair.sigma / root
+        return jnp.where(pair.mask, jnp.where(seen, error, jnp.inf), 0.0)
+
+    return tuple(size(b) for b in linear.gradient)
+
+
+def _partners(known: Normalised) -> tuple[Values, Int[Array, "point"]]:
+    """The correlation largest in size of each point with another, and that other
+    point."""
+    points = jnp.arange(known.w.shape[0])
+
+    def partner(point: Int[Array, ""]):
+        rho = jnp.where(points == point, 0.0, known.row(point))
         other = jnp.argmax(jnp.abs(rho))
         return rho[other], other
 
-    return lax.map(one, jnp.arange(known.w.shape[0]))
+    return lax.map(partner, points)
 
 
 def _least(
@@ -264,16 +269,14 @@ def _least(
     point."""
     own = jnp.arange(known.w.shape[0]) == point
     others = known.tested & ~own
-    rho = jnp.where(others, known.row(point), 0.0)
+    rho = jnp.where(others, known.row(point), 0.0)[None, :]
     across = jnp.sqrt(jnp.maximum(1 - rho**2, SAME))
     w_own = jnp.sum(jnp.where(own[None, :], errors, 0.0), axis=1)
-    v = (errors - rho[None, :] * w_own[:, None]) / across[None, :]
-    larger = jnp.sqrt((1 + rho) / jnp.maximum(1 - rho, SAME))
-    smaller = jnp.sqrt((1 - rho) / jnp.maximum(1 + rho, SAME))
-    in_doubt = (critical.normal(doubt) + rho[None, :] * v) / across[None, :]
-    needed = jnp.maximum(
-        jnp.maximum(larger[None, :] * v, -smaller[None, :] * v), in_doubt
-    )
+    v = (errors - rho * w_own[:, None]) / across
+    larger = jnp.sqrt((1 + rho) / jnp.maximum(1 - rho, SAME)) * v
+    smaller = -jnp.sqrt((1 - rho) / jnp.maximum(1 + rho, SAME)) * v
+    in_doubt = (critical.normal(doubt) + rho * v) / across
+    needed = jnp.maximum(jnp.maximum(larger, smaller), in_doubt)
     needed = jnp.max(jnp.where(others[None, :], needed, -jnp.inf), axis=1)
     return jnp.maximum(needed, limit), jnp.all(jnp.abs(rho) < 1 - SAME)
 
@@ -281,15 +284,8 @@ def _least(
 def _size(
     least: Float[Array, "draw"], power: Array, able: Bool[Array, ""]
 ) -> Float[Array, ""]:
-    """delta with mean Φ(delta - X) = power, by bisection; infinite where it is not
-    able."""
-
-    def halved(_, interval):
-        low, high = interval
-        middle = (low + high) / 2
-        below = jnp.mean(ndtr(middle - least)) < power
-        return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
+    """delta with mean Φ(delta - X) = power; infinite where it is not able."""
+    enough = lambda delta: jnp.mean(ndtr(delta - least)) >= power
     most = jnp.max(least) + 9
-    low, high = lax.fori_loop(0, HALVINGS, halved, (most * 0, most))
-    return jnp.where(able, (low + high) / 2, jnp.inf)
+    delta = bisect(enough, most * 0, most, HALVINGS)
+    return jnp.where(able, delta, jnp.inf)

@@ -2,32 +2,34 @@
 standard deviations assume.
 
 The errors of a coordinate at two points of a photo, d apart, may have the correlation
-rho exp(-(d/l)²), rho at neighbours. Then the whitened residuals r = B e / |B| (B =
-dg/dl of the coplanarity condition) have the covariance
+rho exp(-(d/l)²); rho is that of close neighbours. Then the whitened residuals
+r = B e / |B| (B = dg/dl of the coplanarity condition) have the covariance
 
     1 + rho K,
     K_ij = u_i(left) . u_j(left) exp(-(d_left/l)²) + u_i(right) . u_j(right) exp(-(d_right/l)²),
 
 u = B / |B|, K_ii = 0. The locally best test of rho = 0 is the score (King and Hillier
-1985; of Moran's 1950 form)
+1985; its form is Moran's of 1950)
 
-    T = r' K r / r' r - tr(R K) / (n - 5),    R = 1 - H,
+    T = r' K r / r' r - tr(R K) / (n - 5),    R = 1 - H.
 
-with R the projection by the adjustment, which makes residuals correlated even where the
+R is the projection by the adjustment, which makes residuals correlated even where the
 errors are not. T does not depend on sigma. Its first three moments are exact: with A =
 R (K - tr(R K) / (n - 5)) R and f = n - 5
 
     E T = 0,    E T² = 2 tr A² / (f (f + 2)),    E T³ = 8 tr A³ / (f (f + 2) (f + 4)),
 
-and its distribution is taken as Pearson's type III with these (Henshaw 1966). As l is
-not known, K is the sum over four lengths. Of many pairs f T, its variance and its third
-moment are added up. Agreement along the epipolar lines shows in no residual, nor in
-this test.
+and its distribution is approximated by Pearson's type III with these moments (Henshaw
+1966). As l is not known, K is the sum over four lengths. For many pairs f T, its
+variance and its third moment are added up.
+
+Errors along the epipolar lines change no residual: the test does not see whether they
+agree.
 """
 
 from collections.abc import Callable
 from math import erfc
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,9 +38,9 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
-from ..geometry.linear import Linear, linearised
+from ..geometry.linear import Linear, linearise, namespace
 from ..geometry.pairs import Pair, mask_unusable
-from ..orientation.result import Orientation
+from ..orientation.orient import Orientation
 
 LENGTHS = (0.025, 0.05, 0.1, 0.2)
 """Correlation lengths l that are tried, in units of the side of a square as large as
@@ -46,6 +48,9 @@ the area of the points."""
 
 LEVEL = 0.05
 """Probability below which a pattern is reported."""
+
+NEAR = 1e-6
+"""tr A² below which no two points are near each other at the length of the kernel."""
 
 Values = Float[Array | np.ndarray, "*pairs"]
 
@@ -56,10 +61,10 @@ class Pattern(eqx.Module):
 
     `probability` that independent errors show as much agreement or more. `rho`: the
     estimated correlation of neighbouring errors, in 0 to 1, at the likeliest of the
-    tried lengths; `length`: that length l, in the unit of the photo coordinates.
-    `score`, its `variance` and its `third` moment without correlation: what `pooled`
-    adds up. With fewer than two degrees of freedom, and where no points are near each
-    other, the probability is 1.
+    tried lengths; `length`: this length l, in the unit of the photo coordinates.
+    `score` f T, its `variance` and its `third` moment without correlation, and the
+    `information` on rho: `pool` adds these up. With fewer than two degrees of freedom,
+    and where no points are near each other, the probability is 1.
     """
 
     probability: Values
@@ -81,97 +86,50 @@ class Pattern(eqx.Module):
 def pattern(pair: Pair, orientation: Orientation) -> Pattern:
     """The test of the residuals of one oriented pair, at the rigorous conditions.
 
-    Works under jit and vmap; its memory grows with the square of the number of points.
+    Works under jit and vmap; the memory grows with the square of the number of points.
     """
     pair = mask_unusable(pair)[0]
-    return of_linear(linearised(pair, orientation.pose), pair.coordinates)
+    return of_linear(linearise(pair, orientation.pose), pair.coordinates)
 
 
 def of_linear(linear: Linear, coordinates: tuple[Any, ...]) -> Pattern:
-    """The same from linearised conditions; of NumPy arrays by NumPy."""
-    xp: Any = np if isinstance(linear.weight, np.ndarray) else jnp
-    use = linear.weight > 0
-    n = xp.sum(xp.where(use, 1.0, 0.0))
-    f = n - 5
-    there = f >= 2
-    free = xp.where(there, f, 2.0)
-    root = xp.sqrt(linear.weight)
-    q = xp.stack(_orthonormal([column * root for column in linear.columns], xp))
-    r = linear.g * root
-    for column in q:  # what second-order terms left in the direction of the elements
-        r = r - column * xp.sum(column * r)
-    squares = xp.sum(r * r)
-    share = r / xp.sqrt(xp.where(squares > 0, squares, 1.0))
-
-    def projected(matrix):
-        left = matrix - q.T @ (q @ matrix)
-        return left - (left @ q.T) @ q
-
-    def moments(kernel):
-        """tr(R K), R K R less its mean on the diagonal of R, and T."""
-        inner = projected(kernel)
-        trace = xp.trace(inner)
-        projection = xp.diag(xp.where(use, 1.0, 0.0)) - q.T @ q
-        return (
-            trace,
-            inner - trace / free * projection,
-            xp.sum(share * (kernel @ share)) - trace / free,
-        )
-
-    unit = _extent(coordinates[:2], use, xp)
+    """The test from linearised conditions and the coordinates of the points; computed
+    with NumPy if these are NumPy arrays."""
+    xp = namespace(linear.weight)
+    residuals = _standardise(linear)
+    unit = _extent(coordinates[:2], residuals.use, xp)
+    lengths = [length * unit for length in LENGTHS]
     kernel_of = agreement(linear, coordinates)
-
-    total, candidates = 0.0, []
-    for length in LENGTHS:
-        kernel = kernel_of(length * unit)
-        trace, inner, t = moments(kernel)
-        size = xp.sum(inner * inner)
-        known = size > 1e-6  # else no two points are near each other at this scale
-        standardised = xp.where(known, t / xp.sqrt(xp.where(known, size, 1.0)), 0.0)
-        total = total + kernel
-        # E(r' K r) = sigma² (tr + rho tr(R K R K)) and E(r' r) = sigma² (f + rho tr)
-        full = size + trace**2 / free
-        mean = t + trace / free
-        slope = full - mean * trace
-        rho = xp.where(
-            known & (slope > 0),
-            (mean * free - trace) / xp.where(slope > 0, slope, 1.0),
-            0.0,
-        )
-        candidates.append((standardised, xp.clip(rho, 0.0, 1.0), length * unit, size))
-    _, inner, t = moments(total)
-    square = inner @ inner
-    second, third = xp.trace(square), xp.sum(square * inner)
-    known = there & (second > 1e-6) & (squares > 0)
-    score = xp.where(known, t * free, 0.0)
-    variance = xp.where(known, 2 * second * free / (free + 2), 0.0)
-    skew = xp.where(known, 8 * third * free**2 / ((free + 2) * (free + 4)), 0.0)
-    best, rhos, lengths, sizes = (
-        xp.stack(values) for values in zip(*candidates, strict=True)
+    kernels = [kernel_of(length) for length in lengths]
+    estimates = [_estimate_rho(kernel, residuals) for kernel in kernels]
+    likelihoods, rhos, information = (
+        xp.stack(values) for values in zip(*estimates, strict=True)
     )
-    chosen = xp.argmax(best)
+    best = xp.argmax(likelihoods)
+    known, score, variance, third = _score(sum(kernels), residuals)
     return Pattern(
-        probability=_tail(score, variance, skew, xp),
-        rho=xp.where(known, rhos[chosen], 0.0),
-        length=xp.asarray(lengths[chosen]),
+        probability=_tail(score, variance, third, xp),
+        rho=xp.where(known, rhos[best], 0.0),
+        length=xp.asarray(xp.stack(lengths)[best]),
         score=score,
         variance=variance,
-        third=skew,
-        information=xp.where(known, sizes[chosen], 0.0),
+        third=third,
+        information=xp.where(known, information[best], 0.0),
     )
 
 
 def agreement(linear: Linear, coordinates: tuple[Any, ...]) -> Callable:
-    """The matrix K of a correlation length; of NumPy arrays by NumPy."""
-    xp: Any = np if isinstance(linear.weight, np.ndarray) else jnp
+    """A function that gives the matrix K for a correlation length; computed with NumPy
+    if the arguments are NumPy arrays."""
+    xp = namespace(linear.weight)
     use = linear.weight > 0
     square = sum(b * b for b in linear.gradient)
     norm = xp.sqrt(xp.where(use, square, 1.0))
     both = use[:, None] & use[None, :] & ~np.eye(use.shape[0], dtype=bool)
     photos = []
     for part in (slice(0, 2), slice(2, 4)):
-        along = [b / norm for b in linear.gradient[part]]
-        cosines = sum(u[:, None] * u[None, :] for u in along)
+        directions = [b / norm for b in linear.gradient[part]]
+        cosines = sum(u[:, None] * u[None, :] for u in directions)
         distance = sum((c[:, None] - c[None, :]) ** 2 for c in coordinates[part])
         photos.append((xp.where(both, cosines, 0.0), distance))
 
@@ -180,28 +138,122 @@ def agreement(linear: Linear, coordinates: tuple[Any, ...]) -> Callable:
     )
 
 
-def pooled(patterns: Pattern) -> Pattern:
+def pool(patterns: Pattern) -> Pattern:
     """The test of many pairs together, (pair,): their scores, variances and third
-    moments added up.
+    moments are added up.
 
-    `rho` and `length` are the means of the pairs, weighted by what each tells of rho.
+    `rho` and `length` are the means of the pairs, weighted by their information.
     """
-    xp: Any = np if isinstance(patterns.score, np.ndarray) else jnp
-    score, variance, third = (
-        xp.asarray(xp.sum(x))
-        for x in (patterns.score, patterns.variance, patterns.third)
+    xp = namespace(patterns.score)
+    score, variance, third, information = (
+        xp.asarray(xp.sum(values))
+        for values in (
+            patterns.score,
+            patterns.variance,
+            patterns.third,
+            patterns.information,
+        )
     )
-    weight = patterns.information
-    whole = xp.asarray(xp.sum(weight))
-    share = weight / xp.where(whole > 0, whole, 1.0)
+    weight = patterns.information / xp.where(information > 0, information, 1.0)
     return Pattern(
         probability=_tail(score, variance, third, xp),
-        rho=xp.asarray(xp.sum(share * patterns.rho)),
-        length=xp.asarray(xp.sum(share * patterns.length)),
+        rho=xp.asarray(xp.sum(weight * patterns.rho)),
+        length=xp.asarray(xp.sum(weight * patterns.length)),
         score=score,
         variance=variance,
         third=third,
-        information=whole,
+        information=information,
+    )
+
+
+class _Residuals(NamedTuple):
+    """The whitened residuals of a pair as the test needs them: their `direction` r /
+    |r| and `squares` Σ r², an orthonormal `basis` (5, point) of the design, the points
+    in `use`, and the degrees of `freedom` f, two where there are not `enough`."""
+
+    direction: Any
+    squares: Any
+    basis: Any
+    use: Any
+    freedom: Any
+    enough: Any
+
+    def project(self, matrix):
+        """R M R."""
+        left = matrix - self.basis.T @ (self.basis @ matrix)
+        return left - (left @ self.basis.T) @ self.basis
+
+
+def _standardise(linear: Linear) -> _Residuals:
+    xp = namespace(linear.weight)
+    use = linear.weight > 0
+    freedom = xp.sum(xp.where(use, 1.0, 0.0)) - 5
+    enough = freedom >= 2
+    root = xp.sqrt(linear.weight)
+    basis = xp.stack(_orthonormal_basis([column * root for column in linear.columns]))
+    r = linear.g * root
+    for column in basis:  # second-order terms leave something in these directions
+        r = r - column * xp.sum(column * r)
+    squares = xp.sum(r * r)
+    return _Residuals(
+        direction=r / xp.sqrt(xp.where(squares > 0, squares, 1.0)),
+        squares=squares,
+        basis=basis,
+        use=use,
+        freedom=xp.where(enough, freedom, 2.0),
+        enough=enough,
+    )
+
+
+def _moments(kernel, residuals: _Residuals) -> tuple[Any, Any, Any]:
+    """tr(R K), the matrix A, and T."""
+    xp = namespace(residuals.use)
+    inner = residuals.project(kernel)
+    trace = xp.trace(inner)
+    mean = trace / residuals.freedom
+    everything = xp.diag(xp.where(residuals.use, 1.0, 0.0))
+    projection = everything - residuals.basis.T @ residuals.basis
+    direction = residuals.direction
+    t = xp.sum(direction * (kernel @ direction)) - mean
+    return trace, inner - mean * projection, t
+
+
+def _estimate_rho(kernel, residuals: _Residuals) -> tuple[Any, Any, Any]:
+    """T over its standard deviation (but for a factor that all kernels share), rho, and
+    the information on rho, from one kernel.
+
+    rho solves E(r' K r) / E(r' r) = r' K r / r' r with E(r' K r) = sigma² (tr(R K) +
+    rho tr(R K R K)) and E(r' r) = sigma² (f + rho tr(R K)).
+    """
+    xp, freedom = namespace(residuals.use), residuals.freedom
+    trace, inner, t = _moments(kernel, residuals)
+    information = xp.sum(inner * inner)
+    known = information > NEAR
+    standardised = t / xp.sqrt(xp.where(known, information, 1.0))
+    ratio = t + trace / freedom
+    slope = information + trace**2 / freedom - ratio * trace
+    solvable = known & (slope > 0)
+    rho = (ratio * freedom - trace) / xp.where(slope > 0, slope, 1.0)
+    return (
+        xp.where(known, standardised, 0.0),
+        xp.clip(xp.where(solvable, rho, 0.0), 0.0, 1.0),
+        information,
+    )
+
+
+def _score(kernel, residuals: _Residuals) -> tuple[Any, Any, Any, Any]:
+    """Whether there is a test, f T, its variance and its third moment; zero without a
+    test."""
+    xp, f = namespace(residuals.use), residuals.freedom
+    _, inner, t = _moments(kernel, residuals)
+    square = inner @ inner
+    second, third = xp.trace(square), xp.sum(square * inner)
+    known = residuals.enough & (second > NEAR) & (residuals.squares > 0)
+    return (
+        known,
+        xp.where(known, t * f, 0.0),
+        xp.where(known, 2 * second * f / (f + 2), 0.0),
+        xp.where(known, 8 * third * f**2 / ((f + 2) * (f + 4)), 0.0),
     )
 
 
@@ -214,24 +266,29 @@ def _tail(score, variance, third, xp):
     skewed = xp.abs(skew) > 1e-4
     g = xp.where(skewed, skew, 1.0)
     base = 1 + g * z / 2
-    cubed = xp.sign(base) * xp.abs(base) ** (1 / 3)
-    normal = xp.where(skewed, 6 / g * (cubed - 1) + g / 6, z)
-    return xp.where(known, _upper(normal, xp), 1.0)
+    root = xp.sign(base) * xp.abs(base) ** (1 / 3)
+    normal = xp.where(skewed, 6 / g * (root - 1) + g / 6, z)
+    return xp.where(known, _upper_tail(normal, xp), 1.0)
 
 
-def _upper(z, xp):
+def _upper_tail(z, xp):
+    """The probability of a larger normal number."""
     if xp is jnp:
         return ndtr(-z)
     return np.vectorize(lambda x: 0.5 * erfc(x / np.sqrt(2.0)))(z)
 
 
-def _orthonormal(columns: list, xp) -> list:
-    """An orthonormal basis of the columns, by Gram and Schmidt, twice."""
+def _orthonormal_basis(columns: list) -> list:
+    """An orthonormal basis of the columns, by Gram and Schmidt, twice.
+
+    `correlations.orthonormal_columns` costs one pass over the points, but is no NumPy.
+    """
+    xp = namespace(columns[0])
     basis: list = []
     for column in columns:
         for _ in range(2):
-            for known in basis:
-                column = column - known * xp.sum(known * column)
+            for other in basis:
+                column = column - other * xp.sum(other * column)
             length = xp.sqrt(xp.sum(column * column))
             column = column / xp.where(length > 0, length, 1.0)
         basis.append(column)
@@ -241,10 +298,10 @@ def _orthonormal(columns: list, xp) -> list:
 def _extent(place, use, xp):
     """The side of a square as large as the rectangle that holds the points; at least a
     tenth of its longer side."""
-    sides = [
-        xp.max(xp.where(use, c, -xp.inf)) - xp.min(xp.where(use, c, xp.inf))
-        for c in place
-    ]
-    longer = xp.maximum(*sides)
-    side = xp.maximum(xp.sqrt(xp.maximum(sides[0] * sides[1], 0.0)), 0.1 * longer)
+    sides = []
+    for c in place:
+        last = xp.max(xp.where(use, c, -xp.inf))
+        sides.append(last - xp.min(xp.where(use, c, xp.inf)))
+    area = xp.maximum(sides[0] * sides[1], 0.0)
+    side = xp.maximum(xp.sqrt(area), 0.1 * xp.maximum(*sides))
     return xp.where(xp.isfinite(side) & (side > 0), side, 1.0)

@@ -6,17 +6,18 @@ the condition of a point has
 
     d = Σ_k theta_k s_k,    s_k = Σ (dg/dl)² sigma_l² over its coordinates in group k.
 
-Restricted maximum likelihood, which allows for the five elements of every pair, by
-Fisher scoring; each step is the estimation of Helmert (1907) and MINQUE with the
-weights of the last one (Förstner 1979b; Patterson and Thompson 1971):
+The estimate is restricted maximum likelihood, which allows for the five elements of
+every pair, by Fisher scoring. Each step is the estimation of Helmert (1907), or MINQUE,
+with the weights of the last step (Förstner 1979b; Patterson and Thompson 1971):
 
     F theta = q,    F_kl = tr(P S_k P S_l),    q_k = gᵀ P S_k P g,    P = D⁻¹ - D⁻¹ A N⁻¹ Aᵀ D⁻¹,
 
-summed over the pairs; the covariance of theta is 2 F⁻¹. One linearisation at the given
-poses serves all steps.
+summed over the pairs; the covariance of theta is 2 F⁻¹. The conditions are linearised
+once, at the given poses.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,34 +25,42 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..adjustment import normal_equations as normal
-from ..geometry.linear import Linear, linearised
+from ..adjustment.guarded import ratio
+from ..geometry.linear import Linear, Values, linearise
 from ..geometry.pairs import Pair, mask_unusable
-from ..orientation.result import Orientation
+from ..orientation.orient import Orientation
 from ..xla.passes import sums, total
 from ..xla.programs import Program, is_traced
 
 SURE = 0.5
-"""Standard error of a variance, relative to the pooled variance, above which the group
+"""Standard error of a variance, relative to the pooled variance, above which a group
 counts as not estimable."""
 
 FLOOR = 1e-6
-"""Smallest variance of the iteration, relative to the pooled one; an estimate that
+"""Smallest variance in the iteration, relative to the pooled variance; an estimate that
 reaches it is reported as zero."""
+
+HELD = 1e9
+"""Weight of a bound that a step would cross, relative to the weight of the data."""
+
+CONVERGED = 1e-6
+"""Change of the variances in the last step, relative to the pooled variance."""
 
 
 class Components(eqx.Module):
-    """Standard deviations of K groups, factors to the sigma of the pairs (mm or px
-    where that is 1).
+    """Standard deviations of K groups, as factors of the sigma of the pairs (in mm or
+    px if that is 1).
 
-    `estimable`: whether the pairs determine the group. Where not, its variance was tied
-    to that of all measurements together (`pooled` is its root) by a prior with a
-    standard deviation of half of it; `sigma` is 0 and the errors are infinite. In
-    near-vertical pairs that is so for x, and for y of the left and right photo unless
-    tilts tell them apart: give them one group. `covariance`: of the variances sigma²;
-    rows of what is not estimable are 0. A sigma of 0 that is estimable came out
-    negative: the errors of this group are too small to be seen beside the others, and
-    `variance_error` says how small. Where it has not `converged`, none of this is to be
-    used. `redundancy`: the part of each group in the degrees of freedom.
+    `estimable`: whether the pairs determine the group. If not, its variance was tied to
+    the variance of all measurements together (`pooled` is the root of this) by a prior
+    with a standard deviation of half of it; `sigma` is 0 and the errors are infinite.
+    In near-vertical pairs this is so for x, and for y of the left and right photo
+    unless tilts tell them apart: give them one group. `standard_error` of sigma,
+    `variance_error` of sigma². `covariance` of the variances sigma²; rows of groups
+    that are not estimable are 0. A sigma of 0 that is estimable came out negative: the
+    errors of this group are too small to be seen beside the others, and
+    `variance_error` says how small. `redundancy`: the part of each group in the degrees
+    of freedom. If the estimate has not `converged`, use none of it.
     """
 
     sigma: Float[Array, "group"]
@@ -72,15 +81,15 @@ def estimate(
     *,
     steps: int = 30,
 ) -> Components:
-    """The variance components of a batch of pairs of one camera, (pair, point),
-    oriented in any reasonable way.
+    """The variance components of a batch of oriented pairs of one camera, (pair,
+    point).
 
     `groups`: the group of each measurement of x_left, y_left, x_right, y_right, whole
     numbers from 0 or arrays of them that broadcast to (pair, point). (0, 0, 0, 0) pools
     everything, (0, 1, 0, 2) asks for the y of both photos; arrays (point,) or (pair,
-    point) part points into classes. Pairs whose orientation is not usable do not take
-    part. Works under jit where the groups are known before tracing. Raises ValueError
-    if they are not four, or a number is left out.
+    point) divide points into classes. Pairs whose orientation is not usable do not take
+    part. Works under jit if the groups are known before tracing. Raises ValueError if
+    they are not four, or a number is left out.
     """
     shape = pairs.x_left.shape
     if len(shape) != 2 or len(groups) != 4:
@@ -96,14 +105,10 @@ def estimate(
             "variance_components: groups must be numbered 0, 1, 2, ... without gaps, "
             f"got {names}"
         )
-    labels = tuple(labels)
+    options = {"labels": tuple(labels), "size": len(names), "steps": steps}
     if is_traced((pairs, orientations)):
-        return _estimate(
-            (pairs, orientations), labels=labels, size=len(names), steps=steps
-        )
-    return Program(_estimate, {"labels": labels, "size": len(names), "steps": steps})(
-        (pairs, orientations)
-    )
+        return _estimate((pairs, orientations), **options)
+    return Program(_estimate, options)((pairs, orientations))
 
 
 def by_photo(pairs: Pair, orientations: Orientation, *, steps: int = 30) -> Components:
@@ -116,131 +121,164 @@ def by_photo(pairs: Pair, orientations: Orientation, *, steps: int = 30) -> Comp
     return estimate(pairs, orientations, (0, 0, 1, 1), steps=steps)
 
 
+class _Data(NamedTuple):
+    """The conditions of all pairs, and for every group k the `parts` s_k of the
+    variances of the conditions, (pair, point)."""
+
+    linear: Linear
+    parts: list[Array]
+    mask: Bool[Array, "pair point"]
+
+    def equations(self, theta: Array) -> tuple[Array, Array]:
+        """F and q at the variances theta."""
+        size = len(self.parts)
+        of_pair = jax.vmap(lambda *data: _equations_of_pair(theta, *data))
+        entries = [total(e) for e in of_pair(*self)]
+        lower = [[entries.pop(0) for _ in range(k + 1)] for k in range(size)]
+        return normal.dense(lower), jnp.stack(entries)
+
+
+class _Prior(NamedTuple):
+    """What holds the variances besides the data: a normal prior at `centre` with these
+    weights, zero for estimable groups; and the `floor` below which none may fall."""
+
+    centre: Array
+    weight: Array
+    floor: Array
+
+
 def _estimate(
     data: tuple[Pair, Orientation], *, labels: tuple[Array, ...], size: int, steps: int
 ) -> Components:
     pairs, orientations = data
-    shape = pairs.x_left.shape
-    parted = [jnp.broadcast_to(g if g.ndim != 1 else g[None, :], shape) for g in labels]
     pairs = jax.vmap(lambda p: mask_unusable(p)[0])(pairs)
     pairs = pairs.with_mask(pairs.mask & orientations.usable[:, None])
-    linear = jax.vmap(linearised)(pairs, orientations.pose)
-    parts = [
-        sum(
-            jnp.where(g == k, b**2, 0.0)
-            for g, b in zip(parted, linear.gradient, strict=True)
-        )
-        * pairs.sigma**2
-        for k in range(size)
-    ]
-    freedom = total(jnp.maximum(total(pairs.mask.astype(pairs.sigma.dtype)) - 5, 0.0))
-    there = freedom > 0
+    equations = _data(pairs, orientations, labels, size).equations
+    points = total(pairs.mask.astype(pairs.sigma.dtype))
+    freedom = total(jnp.maximum(points - 5, 0.0))
 
-    def equations(theta: Array):
-        return [
-            total(s)
-            for s in jax.vmap(lambda *of: _of_pair(theta, *of))(
-                linear, parts, pairs.mask
-            )
-        ]
+    f, q = equations(jnp.ones(size, pairs.sigma.dtype))
+    pooled = ratio(jnp.sum(q), freedom, freedom > 0)
+    positive = jnp.where(pooled > 0, pooled, 1.0)
+    estimable = (freedom > 0) & (_errors(f) < SURE)
+    weight = jnp.where(estimable, 0.0, 2 / (SURE * positive) ** 2)
+    prior = _Prior(jnp.full_like(q, pooled), weight, FLOOR * pooled)
 
-    one = jnp.ones(size, pairs.sigma.dtype)
-    f, q = _unpacked(equations(one), size)
-    pooled = jnp.sum(q) / jnp.where(there, freedom, 1.0)
-    safe = jnp.where(pooled > 0, pooled, 1.0)
-    estimable = there & (_errors(f) < SURE)
-    prior = jnp.where(estimable, 0.0, 2 / (SURE * safe) ** 2)
-    least = FLOOR * pooled
-
-    def solved(f, q, centre, prior):
-        right = q - jnp.sum(f * centre[None, :], axis=1)
-        return centre + jnp.stack(
-            normal.solve(_lower(f + jnp.diag(prior)), list(right))
-        )
-
-    def scored(_, state):
+    def score(_, state):
         theta, _ = state
-        f, q = _unpacked(equations(theta), size)
-        new = solved(f, q, one * pooled, prior)
-        # a variance that comes out too small falls tenfold, or steps may run in a
-        # circle; the others have to know it
-        low = jnp.maximum(least, 0.1 * theta)
-        out = new < low
-        new = solved(
-            f,
-            q,
-            jnp.where(out, low, pooled),
-            prior + jnp.where(out, 1e9 * jnp.diagonal(f), 0.0),
-        )
-        new = jnp.where(new > low, new, low)
-        return new, jnp.max(jnp.where(estimable, jnp.abs(new - theta), 0.0)) / safe
+        new = _step(*equations(theta), theta, prior)
+        change = jnp.where(estimable, jnp.abs(new - theta), 0.0)
+        return new, jnp.max(change) / positive
 
-    theta, change = jax.lax.fori_loop(0, steps, scored, (one * pooled, pooled))
-    f, _ = _unpacked(equations(theta), size)
-    error = _errors(f + jnp.diag(prior))
+    theta, change = jax.lax.fori_loop(0, steps, score, (prior.centre, pooled))
+    f, _ = equations(theta)
+    return _components(f, theta, prior, estimable, pooled, freedom, change < CONVERGED)
+
+
+def _data(
+    pairs: Pair, orientations: Orientation, labels: tuple[Array, ...], size: int
+) -> _Data:
+    linear = jax.vmap(linearise)(pairs, orientations.pose)
+    shape = pairs.x_left.shape
+    of_points = lambda g: jnp.broadcast_to(g[None, :] if g.ndim == 1 else g, shape)
+    groups = [of_points(g) for g in labels]
+    squares = [b**2 for b in linear.gradient]
+    parts = []
+    for k in range(size):
+        own = [
+            jnp.where(g == k, b2, 0.0) for g, b2 in zip(groups, squares, strict=True)
+        ]
+        parts.append(sum(own) * pairs.sigma**2)
+    return _Data(linear, parts, pairs.mask)
+
+
+def _step(f: Array, q: Array, theta: Array, prior: _Prior) -> Array:
+    """The variances after one step of Fisher scoring."""
+    new = _solve(f, q, prior.centre, prior.weight)
+    # a variance that comes out too small falls tenfold, or steps may run in a circle;
+    # the step is repeated with it held there, because the others depend on it
+    low = jnp.maximum(prior.floor, 0.1 * theta)
+    out = new < low
+    held = jnp.where(out, HELD * jnp.diagonal(f), 0.0)
+    new = _solve(f, q, jnp.where(out, low, prior.centre), prior.weight + held)
+    return jnp.where(new > low, new, low)
+
+
+def _solve(f: Array, q: Array, centre: Array, weight: Array) -> Array:
+    """The solution of F theta = q with a prior of this centre and weight."""
+    right = q - jnp.sum(f * centre[None, :], axis=1)
+    return centre + jnp.stack(normal.solve(_lower(f + jnp.diag(weight)), list(right)))
+
+
+def _components(
+    f: Array,
+    theta: Array,
+    prior: _Prior,
+    estimable: Array,
+    pooled: Array,
+    freedom: Array,
+    converged: Array,
+) -> Components:
+    information = f + jnp.diag(prior.weight)
+    error = _errors(information)
     estimable = estimable & (error < SURE * pooled)
-    positive = estimable & (theta > least)
+    positive = estimable & (theta > prior.floor)
     sigma = jnp.where(positive, jnp.sqrt(theta), 0.0)
+    standard_error = error / jnp.where(positive, 2 * sigma, 1.0)
     both = estimable[:, None] & estimable[None, :]
     return Components(
-        sigma,
-        jnp.where(positive, error / jnp.where(positive, 2 * sigma, 1.0), jnp.inf),
-        jnp.where(estimable, error, jnp.inf),
-        jnp.where(both, 2 * _inverse(f + jnp.diag(prior)), 0.0),
-        estimable,
-        jnp.sqrt(pooled),
-        theta * jnp.sum(f * theta[None, :], axis=1),
-        freedom.astype(int),
-        change < 1e-6,
+        sigma=sigma,
+        standard_error=jnp.where(positive, standard_error, jnp.inf),
+        variance_error=jnp.where(estimable, error, jnp.inf),
+        covariance=jnp.where(both, 2 * _inverse(information), 0.0),
+        estimable=estimable,
+        pooled=jnp.sqrt(pooled),
+        redundancy=theta * jnp.sum(f * theta[None, :], axis=1),
+        degrees_of_freedom=freedom.astype(int),
+        converged=converged,
     )
 
 
-def _of_pair(
-    theta: Array, linear: Linear, parts: list[Array], mask: Array
+def _equations_of_pair(
+    theta: Array, linear: Linear, parts: list[Values], mask: Array
 ) -> tuple[Array, ...]:
-    """The lower triangle of F and q of one pair, from sums over its points alone:
+    """The lower triangle of F, row by row, and q of one pair, from sums over its points
+    alone:
 
     tr(P S_k P S_l) = Σ s_k s_l (1 - 2 h) / d² + tr(N⁻¹ M_k N⁻¹ M_l),    M_k = Σ s_k a aᵀ / d²
     """
-    terms = [theta[k] * s for k, s in enumerate(parts)]
-    d = sum(terms[1:], terms[0])
-    weight = jnp.where(mask, 1 / jnp.where(mask, d, 1.0), 0.0)
-    columns = [[c] for c in linear.columns]
-    n, right, _ = normal.accumulate([linear.g], columns, [weight])
+    d = sum(theta[k] * s for k, s in enumerate(parts))
+    weight = ratio(1.0, d, mask)
+    inverse, residuals, leverage = _adjust(linear, weight)
+    turned = []
+    for s in parts:
+        m, _, _ = linear.normal_equations(s * weight**2)
+        turned.append(_product(inverse, normal.dense(m)))
+    lower = [(k, l) for k in range(len(parts)) for l in range(k + 1)]
+    factor = weight**2 * (1 - 2 * leverage)
+    own = sums(tuple(parts[k] * parts[l] * factor for k, l in lower))
+    trace = [jnp.sum(turned[k] * turned[l].T) for k, l in lower]
+    f = [a + b for a, b in zip(own, trace, strict=True)]
+    q = sums(tuple(s * residuals**2 for s in parts))
+    enough = total(mask.astype(weight.dtype)) > 5
+    return tuple(jnp.where(enough, entry, 0.0) for entry in (*f, *q))
+
+
+def _adjust(linear: Linear, weight: Values) -> tuple[Array, Values, Values]:
+    """N⁻¹, P g and the leverage h of the points, with these weights."""
+    n, right, _ = linear.normal_equations(weight)
     inverse, _ = normal.inverse(n)
     factor, _ = normal.cholesky(n)
     x = normal.substitute(factor, right)
-    z = normal.substitute(factor, linear.columns)
-    h = weight * sum(a * b for a, b in zip(linear.columns, z, strict=True))
-    v = weight * (
-        linear.g - sum(a * b for a, b in zip(linear.columns, x, strict=True))
-    )  # P g
-    q = normal.dense(inverse)
-    turned = []
-    for s in parts:
-        m, _, _ = normal.accumulate([linear.g], columns, [s * weight**2])
-        turned.append(_product(q, normal.dense(m)))
-    pairs = [(k, l) for k in range(len(parts)) for l in range(k + 1)]
-    own = sums(tuple(parts[k] * parts[l] * weight**2 * (1 - 2 * h) for k, l in pairs))
-    trace = [jnp.sum(turned[k] * turned[l].T) for k, l in pairs]
-    squares = sums(tuple(s * v**2 for s in parts))
-    enough = total(mask.astype(d.dtype)) > 5
-    return tuple(
-        jnp.where(enough, e, 0.0)
-        for e in (*(a + b for a, b in zip(own, trace, strict=True)), *squares)
-    )
+    shifts = normal.substitute(factor, linear.columns)
+    residuals = weight * (linear.g - linear.times(x))
+    leverage = weight * linear.times(shifts)
+    return normal.dense(inverse), residuals, leverage
 
 
 def _product(a: Array, b: Array) -> Array:
     """a b of two small matrices, without a batched matrix product."""
     return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)
-
-
-def _unpacked(entries: list[Array], size: int) -> tuple[Array, Array]:
-    """F as a matrix, and q."""
-    rest = list(entries)
-    lower = [[rest.pop(0) for _ in range(k + 1)] for k in range(size)]
-    return normal.dense(lower), jnp.stack(rest)
 
 
 def _lower(f: Array) -> list[list[Array]]:
@@ -252,9 +290,8 @@ def _inverse(f: Array) -> Array:
 
 
 def _errors(f: Array) -> Array:
-    """Standard errors of the variances; the lifted inverse of a singular F is wrong,
-    but large."""
+    """Standard errors of the variances; the inverse of a singular F is wrong, but
+    large."""
     variance = jnp.diagonal(2 * _inverse(f))
-    return jnp.where(
-        variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), jnp.inf
-    )
+    root = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
+    return jnp.where(variance > 0, root, jnp.inf)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..assessment.propagation import propagate_each
+from ..adjustment.propagation import propagate_each
 from ..surveys import accuracy as accuracy, heights
 
 DEPTH, STEP = 200.0, 20.0

@@ -1,23 +1,34 @@
-"""The conditions of a pair linearised at a pose: what statistics of residuals are made
-of."""
+"""The coplanarity conditions of a pair, linearised at given elements.
 
-from typing import NamedTuple
+For the condition g of a point with the coordinates l, and the local parameters x of the
+elements:
+
+    a = √d ∂(g / √d) / ∂x,    B = ∂g / ∂l,    d = B Q Bᵀ,
+
+d being the variance of g for sigma0 = 1. g / √d is the whitened residual, a / √d its
+row of the design. All statistics of residuals start from these numbers; this is the
+only place that computes them.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from ..adjustment.normal_equations import Lower, accumulate
 from . import coplanarity
-from .elements import RelativePose
+from .elements import AbstractElements
 from .pairs import Coordinates, Pair
 
 Values = Float[Array, "point"]
 
 
 class Linear(NamedTuple):
-    """The conditions of the points at a pose: g, the columns of dg/dx by its five local
-    parameters, the gradient B = dg/dl by the coordinates of a point, and the weights
-    1/d, d = B Q Bᵀ (zero where masked)."""
+    """The linearised conditions of all points: `g`, the five `columns` of a, the
+    `gradient` B, and the `weight` 1 / d. All are zero where a point is masked."""
 
     g: Values
     columns: list[Values]
@@ -26,26 +37,57 @@ class Linear(NamedTuple):
 
     @property
     def squares(self) -> Values:
-        """(r / sigma)² of the points."""
+        """(r / sigma)², the squared whitened residuals."""
         return self.weight * self.g * self.g
 
     def corrections(self, pair: Pair) -> Coordinates:
-        """v = -Q Bᵀ g / d of the coordinates, which bring the rays to intersection."""
+        """v = -Q Bᵀ g / d: corrections of the coordinates with which the rays
+        intersect."""
         factor = -self.g * self.weight * pair.sigma**2
         return tuple(factor * b for b in self.gradient)
 
+    def times(self, x: Sequence[Any]) -> Values:
+        """A x of every point: the change of g by these local parameters, which may
+        differ from point to point."""
+        return sum(a * e for a, e in zip(self.columns, x, strict=True))  # pyright: ignore[reportReturnType]
 
-@jax.jit  # traced once for all who ask
-def linearised(pair: Pair, pose: RelativePose) -> Linear:
-    """The rigorous conditions of one pair at a pose, with its sigma; the pair is
-    free of unusable points."""
-    residuals = coplanarity.residuals(pair, pose)
+    def normal_equations(
+        self, weight: Values | None = None
+    ) -> tuple[Lower, list[Array], Array]:
+        """Σ w aᵀ a (its lower triangle), Σ w a g and Σ w g² with the weights w, those
+        of the conditions if None."""
+        weight = self.weight if weight is None else weight
+        columns = [[column] for column in self.columns]
+        n, right, squares = accumulate([self.g], columns, [weight])
+        return n, right, squares
+
+
+@jax.jit  # traced once for all callers
+def linearise(pair: Pair, elements: AbstractElements) -> Linear:
+    """The rigorous conditions of one pair without unusable points at these elements, with its sigma.
+
+    Works under jit, vmap and grad.
+    """
+    residuals = coplanarity.residuals(pair, elements)
     (g,), jacobian, weight = residuals.columns((jnp.zeros_like(pair.focal_left),) * 5)
+    assert weight is not None  # there is one condition a point
     f = coplanarity.fundamental_matrix(
-        *pose.relative(), pair.focal_left, pair.focal_right
+        *elements.relative(), pair.focal_left, pair.focal_right
     )
-    of_point = jax.grad(coplanarity.condition, argnums=1)
-    gradient = jax.vmap(lambda point: of_point(f, point))(pair.coordinates)
-    used = lambda a: jnp.where(pair.mask, a, 0.0)
-    columns = [used(column) for (column,) in jacobian]
-    return Linear(used(g), columns, tuple(used(b) for b in gradient), weight[0])  # pyright: ignore[reportOptionalSubscript]
+    by_coordinates = jax.grad(coplanarity.condition, argnums=1)
+    gradient = jax.vmap(lambda point: by_coordinates(f, point))(pair.coordinates)
+    used = lambda values: jnp.where(pair.mask, values, 0.0)
+    return Linear(
+        g=used(g),
+        columns=[used(column) for (column,) in jacobian],
+        gradient=tuple(used(b) for b in gradient),
+        weight=weight[0],
+    )
+
+
+def namespace(values: Any) -> Any:
+    """NumPy if `values` is an array of NumPy, else jax.numpy.
+
+    Reports evaluate formulas by NumPy, which has nothing to compile.
+    """
+    return np if isinstance(values, np.ndarray) else jnp

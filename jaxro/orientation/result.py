@@ -51,6 +51,11 @@ class Orientation(eqx.Module):
     result: RESULTS
 
     @property
+    def parameters(self) -> AbstractElements:
+        """The elements, under the name that all adjustments have for them."""
+        return self.elements
+
+    @property
     def covariance(self) -> Float[Array, "*pairs 5 5"]:
         """sigma0² times the cofactors (a posteriori)."""
         return times(self.cofactor, self.sigma0[..., None, None] ** 2)

@@ -18,7 +18,7 @@ from ..adjustment import critical_values
 from ..adjustment.normal_equations import cholesky, substitute
 from ..geometry import coplanarity
 from ..geometry.elements import RelativePose
-from ..geometry.linear import Linear, linearised
+from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Pair
 from ..xla.kernels import while_loop
 from ..xla.passes import count
@@ -102,7 +102,7 @@ def keep_agreeing(
     def turn(state):
         k, _, pose, use = state
         pose = improve(pair, pose, use)
-        w = normalised_residuals(linearised(pair, pose), use)
+        w = normalised_residuals(linearise(pair, pose), use)
         new = pair.mask & (w <= limit)
         changed = count(new ^ use) > 0
         return k + 1, (k == 0) | changed, pose, new
@@ -140,7 +140,7 @@ def one_by_one(
     def turn(state):
         k, _, pose, use, _ = state
         pose = improve(pair, pose, use)
-        linear = linearised(pair, pose)
+        linear = linearise(pair, pose)
         variance, log_det = _variances(linear, use)
         cost = sum_of(jnp.where(use, linear.squares, cut), pair.mask) + log_det
         over = linear.squares / variance - cut

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ..adjustment import critical_values
 from ..adjustment.normal_equations import SINGULAR, cholesky, substitute
 from ..geometry.elements import RelativePose
-from ..geometry.linear import Linear, linearised
+from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import orient
 from ..orientation.starts import AbstractStart, Vertical
@@ -57,7 +57,7 @@ class AllSubsets(AbstractProcedure):
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = orient(fixed, start=self.start(fixed).pose).pose
-        choices = self._shortlists(fixed, linearised(fixed, pose))
+        choices = self._shortlists(fixed, linearise(fixed, pose))
 
         def best_of(carry, omitted):
             left = jax.vmap(lambda out: self._left_over(fixed, pose, out))(omitted)
@@ -84,7 +84,7 @@ class AllSubsets(AbstractProcedure):
         use = pair.mask & ~omitted
         for _ in range(self.iterations):
             pose = improve(pair, pose, use)
-        left = sum_of(linearised(pair, pose).squares, use)
+        left = sum_of(linearise(pair, pose).squares, use)
         masked = count(omitted & ~pair.mask) > 0
         enough = count(pair.mask) - count(omitted) >= self.least
         return jnp.where(enough & ~masked & jnp.isfinite(left), left, jnp.inf)
@@ -132,7 +132,7 @@ class AllSubsets(AbstractProcedure):
         # the optimum does not depend on where it is sought
         start = self.start(lax.stop_gradient(kept)).pose
         solved = orient(kept, start=start)
-        w = normalised_residuals(linearised(pair, solved.pose), use)
+        w = normalised_residuals(linearise(pair, solved.pose), use)
         only = Round(
             statistic=jnp.where(pair.mask, w, 0.0),
             limit=critical_values.normal(self.level) + 0 * count(use),

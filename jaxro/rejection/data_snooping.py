@@ -5,11 +5,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment import critical_values
-from ..assessment.correlations import Normalised, normalised
+from ..assessment.correlations import Normalised, normalise
 from ..assessment.familywise import largest_tau, largest_w
 from ..assessment.undecided import DOUBT, misfit
 from ..geometry.elements import RelativePose
-from ..geometry.linear import linearised
+from ..geometry.linear import linearise
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import orient
 from ..orientation.starts import AbstractStart, Vertical
@@ -77,7 +77,7 @@ class DataSnooping(AbstractProcedure):
     ) -> tuple[PointValues, Float[Array, ""], Bool[Array, "point"]]:
         """|w| or |tau| of every point, the critical value, and the points one of which
         is wrong."""
-        found = normalised(linearised(pair.with_mask(mask), pose), mask)
+        found = normalise(linearise(pair.with_mask(mask), pose), mask)
         limit = self._limit(found)
         w, wrong = misfit(found, limit, self.doubt, self.estimated)
         return w, limit, wrong

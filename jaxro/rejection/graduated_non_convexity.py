@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..geometry.elements import RelativePose
-from ..geometry.linear import linearised
+from ..geometry.linear import linearise
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.starts import AbstractStart, Vertical
 from .agreement import keep_agreeing, state_sigma
@@ -38,7 +38,7 @@ class GraduatedNonConvexity(AbstractSearch):
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = self.search(fixed)
-        use = fixed.mask & (linearised(fixed, pose).squares <= self.limit**2)
+        use = fixed.mask & (linearise(fixed, pose).squares <= self.limit**2)
         pose, use = keep_agreeing(fixed, pose, use, self.limit, self.rounds)
         return verdict(pair, pose, use, self.limit)
 

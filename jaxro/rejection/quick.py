@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..geometry.elements import RelativePose
-from ..geometry.linear import linearised
+from ..geometry.linear import linearise
 from ..geometry.pairs import Pair
 from ..xla.passes import count
 from . import evidence
@@ -38,7 +38,7 @@ class Plain(AbstractStage):
 def _all_agree(
     pair: Pair, pose: RelativePose, limit: Float[Array, ""]
 ) -> Bool[Array, ""]:
-    linear = linearised(pair, pose)
+    linear = linearise(pair, pose)
     small = normalised_residuals(linear, pair.mask) <= limit
     agree = pair.mask & small & seen(pair, pose, limit)
     fits = evidence.fits_well(linear.squares, pair.mask)

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..assessment.undecided import undecided
+from ..assessment.undecided import undecided_points
 from ..geometry.elements import RelativePose, vertical
-from ..geometry.linear import linearised
+from ..geometry.linear import linearise
 from ..geometry.pairs import Pair, mask_unusable
 from ..xla.kernels import if_needed
 from ..xla.passes import count
@@ -71,7 +71,7 @@ class Recommended(AbstractProcedure):
         limit = familywise_limit(self.level, pair)
         pose, use, believed, scale = self._decide(fixed, limit)
         fixed = scale_sigma(fixed, scale)
-        w = normalised_residuals(linearised(fixed, pose), use)
+        w = normalised_residuals(linearise(fixed, pose), use)
         judged = scale_sigma(pair, begin * scale)
         weighted = fade(judged, pose, use & believed)
         weighted = scale_sigma(weighted, 1 / (begin * scale))
@@ -136,7 +136,7 @@ def _in_doubt(
     def find(asked: Bool[Array, ""]) -> Use:
         own = pair.with_mask(pair.mask & asked)
         wrong = out & asked & seen(own, pose, 0.0)
-        return undecided(own, pose, use & asked, wrong)
+        return undecided_points(own, pose, use & asked, wrong)
 
     return if_needed(asked, find, jnp.zeros_like(use))
 

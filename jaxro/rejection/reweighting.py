@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment.losses import AbstractWeight, Huber, Tukey
 from ..geometry.elements import RelativePose
-from ..geometry.linear import linearised
+from ..geometry.linear import linearise
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.starts import AbstractStart, Vertical
 from ..xla.kernels import while_loop
@@ -68,7 +68,7 @@ class Reweighting(AbstractSearch):
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         found = self._solve(fixed)
-        w = normalised_residuals(linearised(fixed, found.pose), found.share)
+        w = normalised_residuals(linearise(fixed, found.pose), found.share)
         use = pair.mask & (w <= self.limit)
         result = verdict(pair, found.pose, use, self.limit, w)
         return result.only_if(self._rests(found), OUTCOMES.did_not_rest)
@@ -89,7 +89,7 @@ class Reweighting(AbstractSearch):
 
         def step(state: State) -> State:
             steps, share = state.steps, state.share
-            linear = linearised(pair, state.pose)
+            linear = linearise(pair, state.pose)
             s = normalised_residuals(linear, share) ** 2
             convex = steps < PLAIN + CONVEX
             new = jnp.where(convex, Huber().weight(s), self.function.weight(s))

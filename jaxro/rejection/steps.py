@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..adjustment.normal_equations import accumulate, solve
 from ..geometry.elements import RelativePose, vertical
-from ..geometry.linear import Linear, linearised
+from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Pair
 from .masked import Use, Values
 
@@ -56,7 +56,7 @@ def inner(one: Sequence[Values], other: Sequence[Values]) -> Values:
 
 def improve(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
     """The pose after one step of least squares on the points in use."""
-    linear = linearised(pair, pose)
+    linear = linearise(pair, pose)
     return take_step(pose, linear, jnp.where(use, linear.weight, 0.0))
 
 
@@ -68,7 +68,7 @@ def improve_within(
 
     def step(k, pose):
         width = limit * jnp.where(k < steps - 1, margin, 1.0)
-        linear = linearised(pair, pose)
+        linear = linearise(pair, pose)
         near = linear.squares <= width**2
         return take_step(pose, linear, jnp.where(near, linear.weight, 0.0))
 
@@ -79,7 +79,7 @@ def step_by_weights(
     pair: Pair, pose: RelativePose, weight: Callable[[Values], Values]
 ) -> RelativePose:
     """The pose after one step in which each point counts by weight((r / sigma)²)."""
-    linear = linearised(pair, pose)
+    linear = linearise(pair, pose)
     return take_step(pose, linear, linear.weight * weight(linear.squares))
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
 from ..geometry.elements import RelativePose
-from ..geometry.linear import linearised
+from ..geometry.linear import linearise
 from ..geometry.pairs import Pair
 from ..orientation.orient import orient
 from ..xla.passes import count
@@ -38,7 +38,7 @@ def verdict(
     use = jnp.where(enough, use, pair.mask)
     solved = orient(pair.with_mask(use), start=pose)
     if w is None:
-        w = normalised_residuals(linearised(pair, solved.pose), use)
+        w = normalised_residuals(linearise(pair, solved.pose), use)
     limit = jnp.asarray(limit, w.dtype)
     unseen = ~use & (w <= limit) & ~seen(pair, solved.pose, limit)
     w = jnp.where(unseen, jnp.inf, w)

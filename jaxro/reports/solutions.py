@@ -21,7 +21,7 @@ from ..assessment import Pattern, neighbours
 from ..assessment.reliability import Reliability, assess
 from ..geometry import rotations as rot
 from ..geometry.elements import AbstractElements, DependentElements, RelativePose
-from ..geometry.linear import Linear, linearised
+from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Camera, Coordinates, Pair, mask_unusable
 from ..orientation.result import Orientation
 from ..orientation.results import RESULTS
@@ -113,7 +113,7 @@ def _told(read: tuple[Pair, Orientation], *, reliable: bool, sigma0) -> tuple:
     if not reliable:
         return o.corrections(pair), elements, None, None
     used = mask_unusable(pair)[0]
-    conditions = linearised(used, o.pose), used.coordinates
+    conditions = linearise(used, o.pose), used.coordinates
     return o.corrections(pair), elements, assess(pair, o, sigma0=sigma0), conditions
 
 
@@ -371,7 +371,5 @@ def pattern_of_all(solved: list[Solution]) -> Pattern | None:
     tells."""
     found = [s.pattern for s in with_pattern(solved) if s.pattern is not None]
     return (
-        neighbours.pooled(jax.tree.map(lambda *a: np.stack(a), *found))
-        if found
-        else None
+        neighbours.pool(jax.tree.map(lambda *a: np.stack(a), *found)) if found else None
     )

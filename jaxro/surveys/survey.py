@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment import critical_values as critical
 from ..adjustment.guarded import root
-from ..assessment.propagation import jacobian, propagate_each
+from ..adjustment.propagation import jacobian, propagate_each
 from ..xla.passes import total
 from ..xla.programs import Program, is_traced
 from ..xla.settings import COMPILE_FAST

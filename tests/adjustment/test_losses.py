@@ -168,6 +168,6 @@ def test_rho_and_its_slope(loss):
     np.testing.assert_allclose(kind.weight(jnp.asarray(s))[1:], slope[1:], atol=1e-6)
     # what is minimised is r near zero, to the last digits
     r = jnp.asarray(np.logspace(-12, -6, 25) * kind.scale)
-    value, slope = jax.vmap(jax.value_and_grad(kind.transformed))(r)
+    value, slope = jax.vmap(jax.value_and_grad(kind.transform))(r)
     np.testing.assert_allclose(value, r, rtol=1e-11)
     np.testing.assert_allclose(slope, 1.0, rtol=1e-11)

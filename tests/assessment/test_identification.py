@@ -12,10 +12,10 @@ import pytest
 import jaxro
 from jaxro import IndependentElements
 from jaxro.assessment import correlations, familywise, identification
-from jaxro.assessment.undecided import undecided
+from jaxro.assessment.undecided import undecided_points
 from jaxro.experiments.compare import Setting, simulate
 from jaxro.geometry import mock_pairs
-from jaxro.geometry.linear import linearised
+from jaxro.geometry.linear import linearise
 from jaxro.rejection import OUTCOMES, DataSnooping
 
 SIGMA = 0.01
@@ -46,7 +46,7 @@ def exact(points, layout=layout):
 
 def known(one):
     pose = jaxro.vertical(jnp.asarray(1.0))
-    return correlations.normalised(linearised(one, pose), one.mask)
+    return correlations.normalise(linearise(one, pose), one.mask)
 
 
 def test_correlations_are_those_of_dense_matrices():
@@ -89,7 +89,7 @@ def largest(points, draws, seed=3):
     """The largest |w| and |tau| of errorless pairs in NumPy, by the projection
     itself."""
     one = exact(points)
-    linear = linearised(one, jaxro.vertical(jnp.asarray(1.0)))
+    linear = linearise(one, jaxro.vertical(jnp.asarray(1.0)))
     a = (
         np.stack([np.asarray(c) for c in linear.columns], axis=1)
         * np.sqrt(np.asarray(linear.weight))[:, None]
@@ -211,7 +211,7 @@ def test_a_verdict_is_doubted_as_the_search_would_have_been():
     always = DataSnooping(level=0.0025, familywise=True, doubt=1.0)
     pairs, out, _, _, pose = cleaned(8, 12.0, 512, always)
     _, _, doubted, _, _ = cleaned(8, 12.0, 512)
-    after = problems.jit(jax.vmap(undecided))(pairs, pose, jnp.asarray(~out))
+    after = problems.jit(jax.vmap(undecided_points))(pairs, pose, jnp.asarray(~out))
     one = np.sum(out, axis=1) == 1
     assert np.sum(one) > 200 and np.mean(np.any(doubted[one], axis=1)) > 0.3
     assert np.mean(np.all(np.asarray(after)[one] == doubted[one], axis=1)) > 0.97

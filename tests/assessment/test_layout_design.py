@@ -52,7 +52,7 @@ def measure():
     logarithms."""
 
     def logarithms(x, y):
-        plan = design.planned(box(TILTED, hills), (x, y), SIGMA)
+        plan = design.plan_layout(box(TILTED, hills), (x, y), SIGMA)
         return jnp.stack([criterion.logarithm(plan, 16.0) for criterion in CRITERIA])
 
     return problems.jit(
@@ -70,7 +70,7 @@ def level():
     """All four criteria of a layout in the plane, photos vertical."""
 
     def criteria(x, y):
-        plan = design.planned(box(), (x, y), SIGMA)
+        plan = design.plan_layout(box(), (x, y), SIGMA)
         return jnp.stack([criterion(plan) for criterion in CRITERIA])
 
     return problems.jit(criteria)
@@ -139,7 +139,7 @@ def test_never_worse_than_the_start(criterion):
     overlap = box(TILTED, hills)
     result, _ = found(criterion, 8, overlap, start=given, starts=2)
     assert result.before.shape == (3,)
-    there = design.planned(overlap, tuple(jnp.asarray(a) for a in given), SIGMA)
+    there = design.plan_layout(overlap, tuple(jnp.asarray(a) for a in given), SIGMA)
     np.testing.assert_allclose(result.before[0], criterion(there), rtol=1e-12)
     assert result.value < 0.95 * result.before[0]
 
@@ -163,7 +163,7 @@ def test_too_few_points_are_no_layout(criterion, points, kept):
 
 def test_accuracy_is_that_of_the_textbook():
     (x, y), lanes = random_positions(1), (37, 9)
-    pair = design.photographed(box(TILTED, hills), (x, y), SIGMA)
+    pair = design.photograph(box(TILTED, hills), (x, y), SIGMA)
     found = oracles.gauss_helmert(
         problems.arrays(pair),
         SIDE,
@@ -217,8 +217,8 @@ def test_symmetries():
 def test_an_error_of_the_detectable_size_moves_its_test_by_delta0():
     """Re-adjusted with the error planted in one y coordinate of a flawless pair: |w| =
     delta0, to first order."""
-    plan = design.planned(box(TILTED, hills), random_positions(4), SIGMA)
-    errors = jnp.stack(design.detectable_errors(plan.pair, plan.adjustment))
+    plan = design.plan_layout(box(TILTED, hills), random_positions(4), SIGMA)
+    errors = jnp.stack(design.detectable_errors(plan))
 
     @problems.jit
     @jax.vmap
@@ -235,8 +235,8 @@ def test_an_error_of_the_detectable_size_moves_its_test_by_delta0():
 def test_heights_deviate_as_simulated():
     """Standard deviations of model heights of 20,000 pairs, to 2 % (four standard
     errors)."""
-    plan = design.planned(box(TILTED, hills), random_positions(5), SIGMA)
-    told = design.height_deviations(plan.adjustment, plan.pair, SIDE)
+    plan = design.plan_layout(box(TILTED, hills), random_positions(5), SIGMA)
+    told = design.height_deviations(plan, plan.pair, SIDE)
     keys = jax.random.split(jax.random.key(1), 20_000)
     pairs = jax.jit(jax.vmap(lambda key: mock_pairs.noisy(plan.pair, key, SIGMA)))(keys)
     heights = jaxro.orient_batch(

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 import jaxro
 from jaxro import IndependentElements, Pair
-from jaxro.assessment import correlated_covariance, neighbours, pattern, pooled
+from jaxro.assessment import correlated_covariance, neighbours, pattern, pool
 from jaxro.cli import app
 from jaxro.geometry import mock_pairs
-from jaxro.geometry.linear import linearised
+from jaxro.geometry.linear import linearise
 from jaxro.rejection.steps import improve
 
 SIGMA = 0.005
@@ -55,7 +55,7 @@ def programs():
         pose = jax.lax.fori_loop(
             0, 4, lambda _, p: improve(pair, p, pair.mask), jaxro.to_pose(elements)
         )
-        return neighbours.of_linear(linearised(pair, pose), pair.coordinates)
+        return neighbours.of_linear(linearise(pair, pose), pair.coordinates)
 
     return jax.jit(jax.vmap(ideal)), jax.jit(
         lambda *a: jax.lax.map(lambda one: solved(*one), a, batch_size=50)
@@ -103,7 +103,7 @@ def test_level_and_power():
     assert abs(flagged - 0.05) < 0.015
     found = judged(40, False, 200, rho=0.5)
     assert np.mean(np.asarray(found.probability) < 0.05) > 0.33
-    together = jax.vmap(pooled)(jax.tree.map(lambda a: a.reshape(-1, 10), found))
+    together = jax.vmap(pool)(jax.tree.map(lambda a: a.reshape(-1, 10), found))
     assert np.all(np.asarray(together.probability) < 0.05)
     np.testing.assert_allclose(np.median(together.rho), 0.5, atol=0.15)
     np.testing.assert_allclose(np.median(together.length), 0.1 * PHOTO, rtol=0.4)
@@ -136,7 +136,7 @@ def test_probability_is_that_of_a_simulation():
     photo = jaxro.orient(pair)
     found = pattern(pair, photo)
     linear, coordinates = jax.tree.map(
-        np.asarray, (linearised(pair, photo.pose), pair.coordinates)
+        np.asarray, (linearise(pair, photo.pose), pair.coordinates)
     )
     in_numpy = neighbours.of_linear(linear, coordinates)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(in_numpy), strict=True):

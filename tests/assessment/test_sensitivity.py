@@ -23,7 +23,8 @@ from jaxro import (
     pair,
     stack,
 )
-from jaxro.assessment import budget, propagation, sensitivity
+from jaxro.adjustment import propagation
+from jaxro.assessment import budget, sensitivity
 from jaxro.geometry import mock_pairs
 from jaxro.orientation import starts
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxro.assessment.propagation import propagate_each
+from jaxro.adjustment.propagation import propagate_each
 from jaxro.experiments import gutkin1982
 from jaxro.surveys import (
     accuracy as accuracy,
