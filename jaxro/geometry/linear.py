@@ -64,7 +64,8 @@ class Linear(NamedTuple):
 
 @jax.jit  # traced once for all callers
 def linearise(pair: Pair, elements: AbstractElements) -> Linear:
-    """The rigorous conditions of one pair without unusable points at these elements, with its sigma.
+    """The rigorous conditions of one pair without unusable points at these elements,
+    with its sigma.
 
     Works under jit, vmap and grad.
     """
