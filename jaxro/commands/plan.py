@@ -47,7 +47,7 @@ def run(options: Options) -> bool:
     reached."""
     plan, deviations = planned(options)
     console, _ = consoles()
-    told = jax.tree.map(float, planning.expected(plan, deviations))
+    told = jax.tree.map(float, planning.expected_accuracy(plan, deviations))
     base = float(np.asarray(plan.base))
     console.print(
         f"f {options.focal:g} mm, H {options.camera_height:g} mm, B {base:g} mm "
@@ -182,7 +182,9 @@ def _needed(
         )
     }
     longest = planning.LARGEST_BASE * options.camera_height
-    best = float(of(planning.expected(plan._replace(base=longest), deviations)))
+    best = float(
+        of(planning.expected_accuracy(plan._replace(base=longest), deviations))
+    )
     if not np.isfinite(base) and not any(highest.values()):
         expected = (
             f"a larger one (± {best:.2f} mm with the largest base at this camera "

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from ..adjustment.results import RESULTS
-from ..surveys import survey as surveys
+from ..surveys import grid_survey
 from ..tables.fields import TableError
 from ..tables.survey import Named
 from . import files
@@ -57,7 +57,7 @@ class Done:
     """A finished survey with its names, as NumPy values."""
 
     named: Named
-    found: surveys.Surveyed
+    found: grid_survey.Surveyed
     traverses: list[Traverse]
     closures: list[Closure]
     origin: list[str]
@@ -88,7 +88,7 @@ class Done:
 def finished(named: Named) -> Done:
     """The survey calculated. Raises TableError where the network of its traverses has
     no solution."""
-    found = jax.tree.map(np.asarray, surveys.solve(named.survey))
+    found = jax.tree.map(np.asarray, grid_survey.solve(named.survey))
     adjusted = found.adjusted
     if adjusted is not None and int(adjusted.result._value) != int(
         RESULTS.successful._value
@@ -120,7 +120,7 @@ def finished(named: Named) -> Done:
     )
 
 
-def _traverses(named: Named, one, found: surveys.Surveyed) -> list[Traverse]:
+def _traverses(named: Named, one, found: grid_survey.Surveyed) -> list[Traverse]:
     if one.network is None or found.adjusted is None:
         return []
     network, adjusted = one.network, found.adjusted
@@ -145,7 +145,7 @@ def _traverses(named: Named, one, found: surveys.Surveyed) -> list[Traverse]:
     return result
 
 
-def _closures(named: Named, one, found: surveys.Surveyed) -> list[Closure]:
+def _closures(named: Named, one, found: grid_survey.Surveyed) -> list[Closure]:
     if found.adjusted is None:
         return []
     height, result = np.asarray(found.heights.value), []
@@ -176,7 +176,7 @@ def contents(done: Done) -> dict[str, Any]:
         "over_grid_mm",
         "sd_over_grid_mm",
     ]
-    header += [f"share_{name}" for name in surveys.Measured._fields]
+    header += [f"share_{name}" for name in grid_survey.Measured._fields]
     lines: list[list[Any]] = [header]
     square = np.asarray(named.survey.square)
     for i in range(named.points):

@@ -5,14 +5,14 @@ of photos (Gutkin 1982).
     (1)  h = H dp / (p_c + dp)                   height over the grid; negative below it
     (5)  h2 - h1 of points in two squares,       (19) in one
 
-with dp the horizontal parallax read at a point less that read at the grid there, H the
-height of the cameras over the grid, B their base, L a side of the square and l its
-length on the photo. Lengths in one unit; every function is the formula for single
+with dp the horizontal parallax of a point less the parallax of the grid beside it, H
+the height of the cameras over the grid, B their base, L a side of the square and l its
+length on the photo. All lengths have one unit. Every function is the formula for single
 numbers and takes arrays that broadcast together.
 
-(1) holds for tilted photos as well, where l and the parallax of the grid are those at
+(1) holds for tilted photos as well, if l and the parallax of the grid are measured at
 the point: on the photo whose mark moves, the right one here, a height displaces the
-point by the picture of B h / (H - h), whatever its tilt.
+point by the image of B h / (H - h), whatever the tilt.
 """
 
 from typing import NamedTuple
@@ -21,6 +21,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 Number = Float[Array, "..."]
+
+
+def as_number(value: ArrayLike) -> Number:
+    """An array of the default precision."""
+    return jnp.asarray(value, float)
 
 
 class Station(NamedTuple):
@@ -39,7 +44,7 @@ class Square(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """A point read in a square: readings of the grid beside the point, and of the point
+    """A point in its square: readings of the grid beside the point, and of the point
     itself."""
 
     square: Square
@@ -49,12 +54,12 @@ class Sight(NamedTuple):
 
 def grid_parallax(base: ArrayLike, photo_side: ArrayLike, side: ArrayLike) -> Number:
     """(2): p_c = B l / L."""
-    return _over(jnp.asarray(photo_side, float) * base, side)
+    return _over(as_number(photo_side) * base, side)
 
 
 def height(camera_height: ArrayLike, p_c: ArrayLike, dp: ArrayLike) -> Number:
     """(1): h = H dp / (p_c + dp), the height of a point over the grid."""
-    return _over(jnp.asarray(camera_height, float) * dp, jnp.asarray(p_c, float) + dp)
+    return _over(as_number(camera_height) * dp, as_number(p_c) + dp)
 
 
 def difference(
@@ -69,17 +74,11 @@ def difference(
     The print of (5), and (6) after it, lack the term p_c2 - p_c1 of the denominator;
     see `difference_short`.
     """
-    shift = jnp.asarray(p_c2, float) - p_c1
+    shift = as_number(p_c2) - p_c1
     bent = _over(shift * dp1, p_c1)
-    return _over(
-        jnp.asarray(camera_height, float) * (jnp.asarray(dp2, float) - dp1 - bent),
-        jnp.asarray(p_c1, float)
-        + dp1
-        + dp2
-        + shift
-        + bent
-        + _over(jnp.asarray(dp1, float) * dp2, p_c1),
-    )
+    product = _over(as_number(dp1) * dp2, p_c1)
+    rise = as_number(camera_height) * (as_number(dp2) - dp1 - bent)
+    return _over(rise, as_number(p_c1) + dp1 + dp2 + shift + bent + product)
 
 
 def difference_short(
@@ -95,14 +94,10 @@ def difference_short(
     (0.13 mm of 20 mm), of which the missing term has 0.73 % and the fraction, which the
     paper neglects knowingly, -0.08 %.
     """
-    bent = _over((jnp.asarray(p_c2, float) - p_c1) * dp1, p_c1)
-    return _over(
-        jnp.asarray(camera_height, float) * (jnp.asarray(dp2, float) - dp1 - bent),
-        jnp.asarray(p_c1, float)
-        + dp1
-        + dp2
-        + _over(jnp.asarray(dp1, float) * dp2, p_c1),
-    )
+    bent = _over((as_number(p_c2) - p_c1) * dp1, p_c1)
+    product = _over(as_number(dp1) * dp2, p_c1)
+    rise = as_number(camera_height) * (as_number(dp2) - dp1 - bent)
+    return _over(rise, as_number(p_c1) + dp1 + dp2 + product)
 
 
 def difference_approximate(
@@ -111,13 +106,11 @@ def difference_approximate(
     """(6'): H (dp2 - dp1) / (p_c + dp1 + dp2), for expected errors only.
 
     In one square (p_c = 17.5, dp = -2) it is 1.7 % too large; in two squares whose p_c
-    differ by 0.1 it is 3 mm off at H = 3500 however small the difference, because dp1
-    dp_c / p_c is missing in the numerator.
+    differ by 0.1 it is wrong by 3 mm at H = 3500 however small the difference, because
+    dp1 (p_c2 - p_c1) / p_c is missing in the numerator.
     """
-    return _over(
-        jnp.asarray(camera_height, float) * (jnp.asarray(dp2, float) - dp1),
-        jnp.asarray(p_c, float) + dp1 + dp2,
-    )
+    rise = as_number(camera_height) * (as_number(dp2) - dp1)
+    return _over(rise, as_number(p_c) + dp1 + dp2)
 
 
 def difference_in_square(
@@ -128,33 +121,28 @@ def difference_in_square(
     return difference(camera_height, p_c, dp1, p_c, dp2)
 
 
-def sighted(station: Station, sight: Sight) -> Number:
-    """The height of a point over the grid from everything measured for it, (1) with
-    (2)."""
-    square = sight.square
-    p_c = grid_parallax(station.base, square.photo_side, square.side)
-    return height(
-        station.camera_height, p_c, jnp.asarray(sight.point, float) - sight.grid
-    )
+def sighted_height(station: Station, sight: Sight) -> Number:
+    """The height of a point over the grid from all its measurements, (1) with (2)."""
+    return height(station.camera_height, *_parallaxes(station, sight))
 
 
 def sighted_difference(station: Station, first: Sight, second: Sight) -> Number:
-    """The difference of height of two points from everything measured for them, (5)
-    with (2)."""
-    p_c = [
-        grid_parallax(station.base, s.square.photo_side, s.square.side)
-        for s in (first, second)
-    ]
-    dp = [jnp.asarray(s.point, float) - s.grid for s in (first, second)]
-    return difference(station.camera_height, p_c[0], dp[0], p_c[1], dp[1])
+    """The difference of height of two points from all their measurements, (5) with
+    (2)."""
+    parallaxes = *_parallaxes(station, first), *_parallaxes(station, second)
+    return difference(station.camera_height, *parallaxes)
+
+
+def _parallaxes(station: Station, sight: Sight) -> tuple[Number, Number]:
+    """p_c and dp."""
+    square = sight.square
+    p_c = grid_parallax(station.base, square.photo_side, square.side)
+    return p_c, as_number(sight.point) - sight.grid
 
 
 def _over(a: ArrayLike, b: ArrayLike) -> Number:
     """a / b, but 0 / 0 = 0: padding, whose numbers are all 0, has height 0."""
-    a, b = jnp.asarray(a, float), jnp.asarray(b, float)
+    a, b = as_number(a), as_number(b)
     there = b != 0
-    return jnp.where(
-        there,
-        a / jnp.where(there, b, 1.0),
-        jnp.where(a == 0, 0.0, jnp.copysign(jnp.inf, a)),
-    )
+    infinite = jnp.where(a == 0, 0.0, jnp.copysign(jnp.inf, a))
+    return jnp.where(there, a / jnp.where(there, b, 1.0), infinite)

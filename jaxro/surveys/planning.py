@@ -1,13 +1,13 @@
-"""What accuracy a survey over a grid will have, before it is made, and what base or
-camera height a wanted one needs.
+"""The accuracy to expect of a survey over a grid before it is made, and the base or
+camera height that a wanted accuracy needs.
 
-Errors are those of exact propagation through `heights` at the planned geometry. In
-traverses the points are read anew for each leg, the grid once in each square, as
-`surveys` takes it: of a leg only the readings of its points add up. Errors of the
-squares and of the grid enter both legs that meet in a point, and cancel except at the
-ends. The error of the camera height enters for one step of height; the middle of a
-traverse that leads down and up again is worse by up to an eighth. The paper's (13) and
-(16), in `height_accuracy`, let everything add up.
+Errors are propagated exactly through `heights` at the planned geometry. In traverses
+the points are read anew for each leg, and the grid once in each square, as in
+`grid_survey`: only the readings of points add up from leg to leg. Errors of the squares
+and of the grid enter both legs that meet in a point, and cancel except at the ends. The
+error of the camera height enters for one step of height; the middle of a traverse that
+leads down and up again is worse by up to 12.5 %. The paper's (13) and (16), in
+`accuracy`, let everything add up.
 """
 
 from collections.abc import Callable
@@ -19,10 +19,30 @@ from jaxtyping import ArrayLike
 
 from ..adjustment.guarded import root
 from .accuracy import Budget, budget
-from .heights import Number, Sight, Square, Station, sighted, sighted_difference
+from .heights import (
+    Number,
+    Sight,
+    Square,
+    Station,
+    as_number,
+    sighted_difference,
+    sighted_height,
+)
 
 LARGEST_BASE = 0.25
 """Of the camera height, (10): beyond it the photos have too little in common."""
+
+SHORTEST_BASE = LARGEST_BASE / 1000
+"""Of the camera height: no shorter base is searched."""
+
+HIGHEST = 20.0
+"""Times the camera height of the plan: no larger one is searched."""
+
+POINTS = 400
+"""Steps of a search, in equal ratios."""
+
+HALVINGS = 60
+"""Of the step in which the wanted value lies."""
 
 
 class Plan(NamedTuple):
@@ -55,20 +75,20 @@ class Deviations(NamedTuple):
 
     @property
     def station(self) -> Station:
-        """Those of the cameras."""
+        """The deviations of the cameras."""
         return Station(self.camera_height, self.base)
 
     @property
     def sight(self) -> Sight:
-        """Those of a point read in a square."""
+        """The deviations of a point read in a square."""
         return Sight(Square(self.side, self.photo_side), self.grid, self.point)
 
 
 class Expected(NamedTuple):
     """Standard deviations: of a height over the grid (1); of the difference to a
     neighbour in the next square (5), and in the same square (19); of the middle of a
-    traverse (13), a node (16), and a point read from that middle (20). NaN is the
-    middle of a single leg, both ends of which are known."""
+    traverse (13), a node (16), and a point read from that middle (20). The middle of a
+    single leg, whose ends are both known, is NaN."""
 
     height: Number
     difference: Number
@@ -84,78 +104,65 @@ def station(plan: Plan) -> Station:
 
 
 def sight(plan: Plan, depth: ArrayLike) -> Sight:
-    """What will be read of a point so far below the grid, the grid itself at 0: p_c = f
-    B / H."""
-    camera_height = jnp.asarray(plan.camera_height, float)
+    """The readings of a point at this depth below the grid, with 0 for the grid itself;
+    p_c = f B / H."""
+    camera_height = as_number(plan.camera_height)
     p_c = plan.focal * plan.base / camera_height
     square = Square(plan.side, plan.focal * plan.side / camera_height)
     return Sight(square, 0.0, -p_c * depth / (camera_height + depth))
 
 
 def height_budget(plan: Plan, deviations: Deviations) -> Budget:
-    """What every source adds to the standard deviation of a height over the grid,
+    """The standard deviation of a height over the grid and its parts from every source,
     mm."""
     values = station(plan), sight(plan, plan.depth)
-    return budget(lambda v: sighted(*v), values, (deviations.station, deviations.sight))
+    spread = deviations.station, deviations.sight
+    return budget(lambda v: sighted_height(*v), values, spread)
 
 
 def difference_budget(plan: Plan, deviations: Deviations) -> Budget:
-    """The same of the difference of height of neighbours in two squares."""
-    values = (
-        station(plan),
-        sight(plan, plan.depth),
-        sight(plan, plan.depth + jnp.asarray(plan.step, float)),
-    )
+    """The same for the difference of height of neighbours in two squares."""
+    second = sight(plan, plan.depth + as_number(plan.step))
+    values = station(plan), sight(plan, plan.depth), second
     spread = deviations.station, deviations.sight, deviations.sight
     return budget(lambda v: sighted_difference(*v), values, spread)
 
 
 def in_square_budget(plan: Plan, deviations: Deviations) -> Budget:
-    """The same of neighbours in one square: its sides and the reading of the grid are
-    those of both."""
-    first, second = (
-        sight(plan, plan.depth + jnp.asarray(step, float)) for step in (0.0, plan.step)
-    )
+    """The same for neighbours in one square, which share its sides and the reading of
+    the grid."""
+    first = sight(plan, as_number(plan.depth))
+    second = sight(plan, plan.depth + as_number(plan.step))
     values = station(plan), first, second.point
-    return budget(
-        lambda v: sighted_difference(v[0], v[1], v[1]._replace(point=v[2])),
-        values,
-        (deviations.station, deviations.sight, deviations.point),
-    )
+    spread = deviations.station, deviations.sight, deviations.point
+
+    def formula(values) -> Number:
+        station, first, point = values
+        return sighted_difference(station, first, first._replace(point=point))
+
+    return budget(formula, values, spread)
 
 
-def expected(plan: Plan, deviations: Deviations) -> Expected:
+def expected_accuracy(plan: Plan, deviations: Deviations) -> Expected:
     """The accuracy to expect. All numbers may be arrays that broadcast."""
     between = difference_budget(plan, deviations)
     in_square = in_square_budget(plan, deviations).deviation
-    legs, traverses = jnp.asarray(plan.legs, float), jnp.asarray(plan.traverses, float)
+    legs, traverses = as_number(plan.legs), as_number(plan.traverses)
     read = between.parts[1].point ** 2 + between.parts[2].point ** 2
-    ends = (
-        between.deviation**2 - read
-    )  # of two points; from two known ones, or k, that of these is divided
-    middle = jnp.where(
-        legs > 1, root(read * legs / 4 + ends * (1 + 1 / 2) / 2), jnp.nan
-    )
+    # the variance of two points but for their readings; the part of k known points is
+    # divided by k
+    ends = between.deviation**2 - read
+    several = legs > 1
+    middle = root(read * legs / 4 + ends * (1 + 1 / 2) / 2)
+    detail = root(jnp.where(several, middle, 0.0) ** 2 + in_square**2)
     return Expected(
-        height_budget(plan, deviations).deviation,
-        between.deviation,
-        in_square,
-        middle,
-        root(read * legs / traverses + ends * (1 + 1 / traverses) / 2),
-        jnp.where(
-            legs > 1,
-            root(jnp.where(legs > 1, middle, 0.0) ** 2 + in_square**2),
-            jnp.nan,
-        ),
+        height=height_budget(plan, deviations).deviation,
+        difference=between.deviation,
+        in_square=in_square,
+        middle=jnp.where(several, middle, jnp.nan),
+        node=root(read * legs / traverses + ends * (1 + 1 / traverses) / 2),
+        detail=jnp.where(several, detail, jnp.nan),
     )
-
-
-POINTS = 400
-HALVINGS = 60
-SHORTEST_BASE = LARGEST_BASE / 1000
-"""Of the camera height: no shorter base is looked at."""
-HIGHEST = 20.0
-"""Times the camera height of the plan: none higher is looked at."""
 
 
 def least(
@@ -164,10 +171,12 @@ def least(
     low: ArrayLike,
     high: ArrayLike,
 ) -> Number:
-    """The least x in [low, high] with error(x) <= wanted, infinite where there is none.
-    `error` takes arrays; it may rise and fall, but not within a step of 1/400 of the
-    (logarithmic) range."""
-    return _outermost(error, wanted, jnp.asarray(low, float), jnp.asarray(high, float))
+    """The least x in [low, high] with error(x) <= wanted; infinite if there is none.
+
+    `error` takes arrays; it may rise and fall, but not within one of the `POINTS` steps
+    in equal ratios.
+    """
+    return _outermost(error, wanted, as_number(low), as_number(high))
 
 
 def largest(
@@ -176,8 +185,8 @@ def largest(
     low: ArrayLike,
     high: ArrayLike,
 ) -> Number:
-    """The largest such x; 0 where there is none."""
-    found = _outermost(error, wanted, jnp.asarray(high, float), jnp.asarray(low, float))
+    """The largest such x; 0 if there is none."""
+    found = _outermost(error, wanted, as_number(high), as_number(low))
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
 
@@ -187,15 +196,14 @@ def _outermost(error, wanted, begin, end) -> Number:
     good = error(x) <= wanted
     first = jnp.argmax(good)
 
-    def halved(_, interval):
+    def halve(_, interval):
         bad, fine = interval
         middle = jnp.sqrt(bad * fine)
         passes = error(middle) <= wanted
         return jnp.where(passes, bad, middle), jnp.where(passes, middle, fine)
 
-    _, found = lax.fori_loop(
-        0, HALVINGS, halved, (x[jnp.maximum(first - 1, 0)], x[first])
-    )
+    interval = x[jnp.maximum(first - 1, 0)], x[first]
+    _, found = lax.fori_loop(0, HALVINGS, halve, interval)
     return jnp.where(jnp.any(good), found, jnp.inf)
 
 
@@ -205,14 +213,13 @@ def base_needed(
     wanted: ArrayLike,
     of: Callable[[Expected], Number],
 ) -> Number:
-    """The shortest base that gives this quantity the wanted standard deviation, at most
-    a quarter of the camera height; infinite where not even that does. None below
-    SHORTEST_BASE is looked at."""
-    camera_height = jnp.asarray(plan.camera_height, float)
-    error = lambda base: of(expected(plan._replace(base=base), deviations))
-    return least(
-        error, wanted, SHORTEST_BASE * camera_height, LARGEST_BASE * camera_height
-    )
+    """The shortest base, from SHORTEST_BASE to LARGEST_BASE of the camera height, that
+    gives the quantity of(Expected) the wanted standard deviation; infinite if none
+    does."""
+    camera_height = as_number(plan.camera_height)
+    error = lambda base: of(expected_accuracy(plan._replace(base=base), deviations))
+    low, high = SHORTEST_BASE * camera_height, LARGEST_BASE * camera_height
+    return least(error, wanted, low, high)
 
 
 def camera_height_allowed(
@@ -223,25 +230,21 @@ def camera_height_allowed(
     *,
     fixed_ratio: bool,
 ) -> Number:
-    """The largest camera height, up to HIGHEST times that of the plan, at which this
-    quantity has the wanted standard deviation, with the base of the plan (then not
-    below four bases) or (`fixed_ratio`) its H : B; 0 where none has.
+    """The largest camera height, up to HIGHEST times the one of the plan, at which the
+    quantity of(Expected) has the wanted standard deviation; 0 if there is none. The
+    base is the one of the plan (the height is then at least four bases), or
+    (`fixed_ratio`) grows with the height.
 
     A height over the grid has a best camera height: below it the error of H grows,
-    above it that of the readings.
+    above it the error of the readings.
     """
-    now = jnp.asarray(plan.camera_height, float)
+    now = as_number(plan.camera_height)
     ratio = plan.base / now
 
     def error(camera_height):
         base = ratio * camera_height if fixed_ratio else plan.base
-        return of(
-            expected(plan._replace(camera_height=camera_height, base=base), deviations)
-        )
+        moved = plan._replace(camera_height=camera_height, base=base)
+        return of(expected_accuracy(moved, deviations))
 
-    return largest(
-        error,
-        wanted,
-        now / HIGHEST if fixed_ratio else plan.base / LARGEST_BASE,
-        HIGHEST * now,
-    )
+    low = now / HIGHEST if fixed_ratio else plan.base / LARGEST_BASE
+    return largest(error, wanted, low, HIGHEST * now)

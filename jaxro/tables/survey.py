@@ -1,4 +1,4 @@
-"""Tables of a survey over a grid: CSV text in, a named `surveys.Survey` out, or one
+"""Tables of a survey over a grid: CSV text in, a named `grid_survey.Survey` out, or one
 clear error. All in mm.
 
 readings   point, square, parallax; optionally grid (the grid read at the point),
@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ..surveys.levelling import unconnected
+from ..surveys.grid_survey import Measured, Survey, survey
+from ..surveys.networks import unconnected_points
 from ..surveys.planning import Deviations
-from ..surveys.survey import Measured, Survey, survey
 from . import fields
 from .fields import Columns, TableError
 
@@ -420,7 +420,7 @@ def _check_legs(
     used = np.unique([start, end])
     lost = set(
         used[
-            unconnected(
+            unconnected_points(
                 np.searchsorted(used, start), np.searchsorted(used, end), known[used]
             )
         ].tolist()

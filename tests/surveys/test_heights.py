@@ -10,9 +10,9 @@ from jaxro.adjustment.propagation import propagate_each
 from jaxro.experiments import gutkin1982
 from jaxro.surveys import (
     accuracy as accuracy,
+    grid_survey,
     heights,
     planning as planning,
-    survey as surveys,
 )
 from jaxro.surveys.heights import Sight, Square, Station
 
@@ -39,7 +39,7 @@ def test_heights_are_those_of_two_cameras():
         heights.grid_parallax(base, 100.0 * focal / camera, 100.0), p_c, rtol=1e-14
     )
     np.testing.assert_allclose(heights.height(camera, p_c, p - p_c), h, atol=1e-10)
-    seen = heights.sighted(
+    seen = heights.sighted_height(
         Station(camera, base),
         Sight(Square(100.0, 100 * focal / camera), 12.0, 12.0 + p - p_c),
     )
@@ -98,7 +98,10 @@ def test_padding_is_zero_and_derivatives_are_finite():
     slopes = jax.grad(
         lambda station, s: heights.sighted_difference(station, s, s).sum(), (0, 1)
     )(Station(0.0, 0.0), Sight(Square(0.0, 0.0), 0.0, 0.0))
-    assert heights.sighted(Station(0.0, 0.0), Sight(Square(0.0, 0.0), 0.0, 0.0)) == 0
+    assert (
+        heights.sighted_height(Station(0.0, 0.0), Sight(Square(0.0, 0.0), 0.0, 0.0))
+        == 0
+    )
     assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(slopes))
 
 
@@ -117,7 +120,7 @@ def draws():
             for a, e, s in zip(leaves, errors, jax.tree.leaves(spread), strict=True)
         ]
         station, first, second = jax.tree.unflatten(structure, moved)
-        return heights.sighted(station, first), heights.sighted_difference(
+        return heights.sighted_height(station, first), heights.sighted_difference(
             station, first, second
         )
 
@@ -130,7 +133,7 @@ def draws():
 
 def test_propagation_is_monte_carlo(draws):
     values, spread, (height, difference) = draws
-    one = lambda v: heights.sighted(v[0], v[1])
+    one = lambda v: heights.sighted_height(v[0], v[1])
     two = lambda v: heights.sighted_difference(*v)
     np.testing.assert_allclose(
         propagate_each(one, values, spread), np.std(height), rtol=0.02
@@ -304,7 +307,7 @@ def test_a_plan_tells_what_the_paper_expects_and_what_a_survey_has():
     """Its case H = 3500, B max; and a mock survey of one traverse between two known
     points."""
     plan = planning.Plan(75.0, 3500.0, 3500 / 4, depth=200.0)
-    told = planning.expected(
+    told = planning.expected_accuracy(
         plan, planning.Deviations(grid=0.0057)
     )  # with the point's 4 µm the 7 µm of the table
     np.testing.assert_allclose(told.height, 1.78, atol=0.05)
@@ -315,7 +318,7 @@ def test_a_plan_tells_what_the_paper_expects_and_what_a_survey_has():
     sight = planning.sight(plan, plan.depth)
     same = lambda value, size: jnp.full(size, value, float)
     reading = sight.point
-    measured = surveys.Measured(
+    measured = grid_survey.Measured(
         jnp.asarray(2100.0),
         jnp.asarray(400.0),
         *(same(a, count) for a in (100.0, sight.square.photo_side, 0.0, reading)),
@@ -323,9 +326,9 @@ def test_a_plan_tells_what_the_paper_expects_and_what_a_survey_has():
         same(reading, n),
     )
     place = np.arange(count)
-    survey = surveys.survey(
+    survey = grid_survey.survey(
         measured,
-        surveys.Measured(
+        grid_survey.Measured(
             *map(
                 jnp.asarray,
                 (
@@ -347,8 +350,8 @@ def test_a_plan_tells_what_the_paper_expects_and_what_a_survey_has():
         end=place[1:],
     )
     np.testing.assert_allclose(
-        surveys.solve(survey).deviations.value[n // 2],
-        planning.expected(plan, sd).middle,
+        grid_survey.solve(survey).deviations.value[n // 2],
+        planning.expected_accuracy(plan, sd).middle,
         rtol=1e-6,
     )
 
@@ -358,7 +361,7 @@ def test_a_plan_answers_the_inverse_question():
     of = lambda expected: expected.difference
     base = planning.base_needed(plan, sd, 2.5, of)
     np.testing.assert_allclose(
-        of(planning.expected(plan._replace(base=base), sd)), 2.5, rtol=1e-9
+        of(planning.expected_accuracy(plan._replace(base=base), sd)), 2.5, rtol=1e-9
     )
     assert np.isinf(planning.base_needed(plan, sd, 0.5, of))
     assert np.isinf(
@@ -373,7 +376,9 @@ def test_a_plan_answers_the_inverse_question():
         moved = plan._replace(
             camera_height=high, base=500.0 / 3500 * high if fixed_ratio else 500.0
         )
-        np.testing.assert_allclose(of(planning.expected(moved, sd)), 1.5, rtol=1e-9)
+        np.testing.assert_allclose(
+            of(planning.expected_accuracy(moved, sd)), 1.5, rtol=1e-9
+        )
         assert (
             planning.camera_height_allowed(plan, sd, 0.01, of, fixed_ratio=fixed_ratio)
             == 0

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxro.surveys import mock as mock_surveys, survey as surveys
+from jaxro.surveys import grid_survey, mock_surveys
 
-SD = surveys.Measured(10.0, 0.5, 0.17, 0.007, 0.0038, 0.004, 0.004, 0.004)
+SD = grid_survey.Measured(10.0, 0.5, 0.17, 0.007, 0.0038, 0.004, 0.004, 0.004)
 SCENE = mock_surveys.Scene()
 DRAWS = 4000
 
@@ -20,14 +20,14 @@ def mock():
 
 @pytest.fixture(scope="module")
 def solved(mock):
-    return surveys.solve(mock.survey)
+    return grid_survey.solve(mock.survey)
 
 
 @pytest.fixture(scope="module")
 def drawn(mock):
     """Errors of the heights, and misclosures, of many surveys of the same scene."""
-    survey, variances = mock.survey, surveys.leg_variances(mock.survey)
-    one = lambda key: surveys.heights(
+    survey, variances = mock.survey, grid_survey.leg_variances(mock.survey)
+    one = lambda key: grid_survey.heights(
         survey, mock_surveys.noisy(survey.measured, survey.deviations, key), variances
     )[0]
     found = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(4), DRAWS))
@@ -55,8 +55,8 @@ def test_without_errors_heights_are_the_truth():
         "nearest": SCENE._replace(nearest=True),
     }.items():
         mock = mock_surveys.mock_survey(scene, SD)
-        found = surveys.heights(
-            mock.survey, mock.survey.measured, surveys.leg_variances(mock.survey)
+        found = grid_survey.heights(
+            mock.survey, mock.survey.measured, grid_survey.leg_variances(mock.survey)
         )[0]
         off[name] = np.abs(
             np.stack([found.value, found.over_grid]) - mock.truth[None, :]
@@ -91,10 +91,10 @@ def test_heights_come_back_within_their_standard_deviations(mock, solved, drawn)
 def test_what_a_wrong_camera_height_does(mock):
     """30 mm: heights over the grid move by 30 h / H, those read from points of known
     height hardly."""
-    survey, variances = mock.survey, surveys.leg_variances(mock.survey)
+    survey, variances = mock.survey, grid_survey.leg_variances(mock.survey)
     wrong = survey.measured._replace(camera_height=survey.measured.camera_height + 30)
-    right = surveys.heights(survey, survey.measured, variances)[0]
-    moved = surveys.heights(survey, wrong, variances)[0]
+    right = grid_survey.heights(survey, survey.measured, variances)[0]
+    moved = grid_survey.heights(survey, wrong, variances)[0]
     np.testing.assert_allclose(
         moved.over_grid - right.over_grid, mock.truth * 30 / 2100, atol=0.03
     )
@@ -112,7 +112,7 @@ def test_tests_of_traverses_are_those_of_the_network_where_errors_are_the_legs_o
     alone = jax.tree.map(jnp.zeros_like, one.deviations)._replace(
         back=one.deviations.back, fore=one.deviations.fore
     )
-    noisy = lambda deviations: surveys.survey(
+    noisy = lambda deviations: grid_survey.survey(
         measured,
         deviations,
         square=one.square,
@@ -123,12 +123,12 @@ def test_tests_of_traverses_are_those_of_the_network_where_errors_are_the_legs_o
         start=one.start,
         end=one.end,
     )
-    found = surveys.solve(noisy(alone))
+    found = grid_survey.solve(noisy(alone))
     np.testing.assert_allclose(found.w, found.adjusted.w, atol=1e-9)
     np.testing.assert_allclose(found.detectable, found.adjusted.detectable, rtol=1e-9)
     network = found.deviations.value[: len(one.levelled)]
     np.testing.assert_allclose(network, found.adjusted.deviations, atol=1e-9)
-    every = surveys.solve(noisy(one.deviations))
+    every = grid_survey.solve(noisy(one.deviations))
     assert np.all(
         np.abs(every.w) <= np.abs(found.w) + 1e-12
     )  # errors in common can only add
