@@ -162,7 +162,7 @@ def chances(
     delta = linear.gradient[coordinate] * size * root / jnp.asarray(sigma0)
     errors = _draw_errors(known, key, draws)
 
-    def with_error(point: Int[Array, ""]) -> Chances:
+    def with_error(point: Int[Array, ""]) -> tuple[Float[Array, ""], ...]:
         own = jnp.arange(known.w.shape[0]) == point
         shift = known.row(point) * jnp.sum(jnp.where(own, delta, 0.0))
         outcomes = jax.vmap(lambda w: _judge(known, w + shift, own, limit, doubt))
@@ -172,25 +172,26 @@ def chances(
             lambda happened: jnp.where(tested, share(happened), 0.0), outcomes(errors)
         )
 
-    return lax.map(with_error, jnp.arange(known.w.shape[0]))
+    correct, wrong, undecided, misled, missed = lax.map(
+        with_error, jnp.arange(known.w.shape[0])
+    )
+    return Chances(
+        correct=correct, wrong=wrong, undecided=undecided, misled=misled, missed=missed
+    )
 
 
 def _judge(
     known: Normalised, w: Values, own: Bool[Array, "point"], limit: Array, doubt: float
-) -> Chances:
-    """What a test of these w names, given that the error is in the `own` point: exactly
-    one field is True."""
+) -> tuple[Bool[Array, ""], ...]:
+    """Which of the fields of `Chances` happens with these w, if the error is in the
+    `own` point: exactly one is True."""
     size = jnp.abs(w)
     named = explanations(known._replace(w=w), jnp.argmax(size), doubt)
     found = jnp.max(size) > limit
     alone, among = jnp.sum(named) == 1, jnp.any(named & own)
-    return Chances(
-        correct=found & among & alone,
-        wrong=found & ~among & alone,
-        undecided=found & among & ~alone,
-        misled=found & ~among & ~alone,
-        missed=~found,
-    )
+    correct, wrong = found & among & alone, found & ~among & alone
+    several, misled = found & among & ~alone, found & ~among & ~alone
+    return correct, wrong, several, misled, ~found
 
 
 class _Read(NamedTuple):
