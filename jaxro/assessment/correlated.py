@@ -45,7 +45,8 @@ def correlated_covariance(
     """
     pair = mask_unusable(pair)[0]
     linear = linearise(pair, orientation.elements)
-    rows = jnp.stack(linear.columns) * jnp.sqrt(linear.weight)
+    root = jnp.sqrt(linear.weight)
+    rows = jnp.stack([column * root for column in linear.columns])
     inverse, _ = normal.inverse(linear.normal_equations()[0])
     q = normal.dense(inverse)
     rho, length = (jnp.asarray(x, rows.dtype) for x in (rho, length))
