@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, PyTree
 
 from ..adjustment.guarded import ratio, root
-from ..xla.reductions import total
+from ..xla.passes import total
 from .heights import Number, as_number
 
 

@@ -29,8 +29,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ..adjustment import critical_values as critical
 from ..adjustment.guarded import ratio, root
 from ..adjustment.propagation import jacobian, propagate_each
-from ..xla.programs import QUICK, Program, traced
-from ..xla.reductions import total
+from ..xla.passes import total
+from ..xla.programs import Program, is_traced
+from ..xla.settings import COMPILE_FAST
 from .heights import Number, Sight, Square, Station, sighted_height
 from .levelling import Levelled, adjust_heights
 from .networks import Flags, Network, Places, network
@@ -221,9 +222,9 @@ def solve(survey: Survey, *, level: float = 0.001, power: float = 0.80) -> Surve
     """Heights with their standard deviations, and the tests of the traverses. Works
     under jit and vmap."""
     options = {"level": level, "power": power}
-    if traced(survey):
+    if is_traced(survey):
         return _solve(survey, **options)
-    return Program(_solve, options, QUICK)(survey)
+    return Program(_solve, options, COMPILE_FAST)(survey)
 
 
 def _solve(survey: Survey, level: float, power: float) -> Surveyed:

@@ -27,7 +27,7 @@ from ..adjustment import JointAdjustment, Term, adjust, critical_values as criti
 from ..adjustment.critical_values import UNTESTABLE
 from ..adjustment.guarded import ratio, root
 from ..adjustment.results import RESULTS
-from ..xla.reductions import total
+from ..xla.passes import total
 from .networks import (
     Network as Network,
     PerLeg,

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from ..geometry import rotations as rot
-from ..geometry.mock_pairs import projected
+from ..geometry.mock_pairs import project
 from .grid_survey import Measured, Survey, survey
 
 Squares = list[tuple[int, int]]
@@ -79,7 +79,7 @@ def photo(
 
     def of_point(x, y, z):
         ray = x - station, y - middle[1], z - scene.camera_height
-        u, v = projected(rotation, ray, scene.focal)
+        u, v = project(rotation, ray, scene.focal)
         bent = 1 + scene.distortion / 20**3 * (u * u + v * v)
         return u * bent, v * bent
 
