@@ -50,15 +50,7 @@ def orient(
     base: given.Base = None,
     residual: given.Minimised = Residual.rigorous,
     unit: given.Unit = "mm",
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for elements.csv, residuals.csv, points.csv, reliability.csv, "
-            "summary.json.",
-            metavar="DIR",
-            show_default=False,
-        ),
-    ] = None,
+    out: given.OrientedFiles = None,
     force: given.Force = False,
     confidence: given.Confidence = None,
     tables: given.Tables = None,
@@ -71,23 +63,25 @@ def orient(
 
     Exit code 0: all usable; 1: some pair failed; 2: bad input, nothing written.
     """
-    from .commands.orient import Options, run
+    from .commands.orient import run
+    from .commands.request import Options
 
     options = Options(
-        file,
-        camera,
-        focal,
-        principal_point,
-        pixel_size,
-        y_down,
-        sigma,
-        elements,
-        base,
-        residual,
-        unit,
-        out,
-        force,
-    ).at_level(confidence)
+        file=file,
+        camera=camera,
+        focal=focal,
+        principal_point=principal_point,
+        pixel_size=pixel_size,
+        y_down=y_down,
+        sigma=sigma,
+        elements=elements,
+        base=base,
+        residual=residual,
+        unit=unit,
+        out=out,
+        force=force,
+        confidence=confidence,
+    )
     if given.large(file, parquet, resume, tables, engine):
         from .commands import large
 
@@ -131,16 +125,7 @@ def clean(
     base: given.Base = None,
     residual: given.Minimised = Residual.rigorous,
     unit: given.Unit = "mm",
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for cleaned.csv (every row with its verdict), decisions.csv "
-            "and decisions.json (how it came "
-            "about), and of the points kept the files of `jaxro orient`.",
-            metavar="DIR",
-            show_default=False,
-        ),
-    ] = None,
+    out: given.CleanedFiles = None,
     force: given.Force = False,
     tables: given.Tables = None,
     resume: given.Resume = False,
@@ -152,30 +137,30 @@ def clean(
     Which, in what order, on what evidence; and the orientation of the points kept. Exit
     code 0: all cleaned and usable; 1: some pair not; 2: bad input, nothing written.
     """
-    from .commands.clean import DEFAULT, chosen, run
-    from .commands.orient import Options
+    from .commands.clean import DEFAULT, choose_procedure, run
+    from .commands.request import Options
 
     options = Options(
-        file,
-        camera,
-        focal,
-        principal_point,
-        pixel_size,
-        y_down,
-        sigma,
-        elements,
-        base,
-        residual,
-        unit,
-        out,
-        force,
+        file=file,
+        camera=camera,
+        focal=focal,
+        principal_point=principal_point,
+        pixel_size=pixel_size,
+        y_down=y_down,
+        sigma=sigma,
+        elements=elements,
+        base=base,
+        residual=residual,
+        unit=unit,
+        out=out,
+        force=force,
     )
     name, changes = DEFAULT if procedure is None else procedure, tolerance or []
     if given.large(file, parquet, resume, tables, engine):
         from .commands import large
 
         how = large.Large(tables, resume, engine=_engine(engine))
-        _end(lambda: large.run(options, how, chosen(name, changes)))
+        _end(lambda: large.run(options, how, choose_procedure(name, changes)))
     else:
         _end(lambda: run(options, name, changes))
 
@@ -215,7 +200,17 @@ def colmap(
     """
     from .commands.colmap import Options, run
 
-    _end(lambda: run(Options(database, sigma, out, force, assume_calibrated)))
+    _end(
+        lambda: run(
+            Options(
+                database=database,
+                sigma=sigma,
+                out=out,
+                force=force,
+                assume_calibrated=assume_calibrated,
+            )
+        )
+    )
 
 
 @app.command()
@@ -235,23 +230,10 @@ def compare(
             show_default=False,
         ),
     ] = None,
-    errors: Annotated[
-        str, typer.Option(help="Numbers of wrong points.", metavar="N,N,...")
-    ] = "0,1,2,3",
-    size: Annotated[
-        str, typer.Option(help="Sizes of their errors, in sigma.", metavar="K,K,...")
-    ] = "4,6,8,10,15",
-    trials: Annotated[
-        int, typer.Option(help="Simulated pairs in every setting.", metavar="T")
-    ] = 1000,
-    false_alarms: Annotated[
-        float,
-        typer.Option(
-            help="Share of pairs without errors that lose a point in the comparison at "
-            "equal terms; 0: without it.",
-            metavar="P",
-        ),
-    ] = 0.05,
+    errors: given.WrongPoints = "0,1,2,3",
+    size: given.ErrorSizes = "4,6,8,10,15",
+    trials: given.Trials = 1000,
+    false_alarms: given.FalseAlarms = 0.05,
     seed: given.Seed = 0,
     camera: given.Camera = None,
     focal: given.Focal = None,
@@ -277,23 +259,35 @@ def compare(
             show_default=False,
         ),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Overwrite the file of --out.")
-    ] = False,
+    force: given.ForceFile = False,
 ) -> None:
     """Compare procedures on the layout of FILE.
 
     By simulation: what each finds of the errors planted, and what it costs in good
     points. Exit code 0: done; 2: bad input, nothing written.
     """
-    from .commands.orient import Options
+    from .commands.request import Options
     from .commands.simulate import Wanted, run_comparison
 
     options = Options(
-        file, camera, focal, principal_point, pixel_size, y_down, sigma, unit=unit
+        file=file,
+        camera=camera,
+        focal=focal,
+        principal_point=principal_point,
+        pixel_size=pixel_size,
+        y_down=y_down,
+        sigma=sigma,
+        unit=unit,
     )
     wanted = Wanted(
-        procedure or [], errors, size, trials, seed, false_alarms, out, force
+        procedures=procedure or [],
+        errors=errors,
+        sizes=size,
+        trials=trials,
+        seed=seed,
+        false_alarms=false_alarms,
+        out=out,
+        force=force,
     )
     _end(lambda: run_comparison(options, wanted))
 
@@ -321,9 +315,9 @@ def reproduce(
     ] = None,
 ) -> None:
     """Calculate a paper's tables beside the print."""
-    from .commands import simulate as simulating
+    from .commands import simulate
 
-    _end(lambda: simulating.reproduce(name, trials, seed))
+    _end(lambda: simulate.reproduce(name, trials, seed))
 
 
 @app.command()
@@ -364,7 +358,16 @@ def heights(
 
     _end(
         lambda: run(
-            Options(file, grid, traverses, camera_height, base, sd or [], out, force)
+            Options(
+                file=file,
+                grid=grid,
+                traverses=traverses,
+                camera_height=camera_height,
+                base=base,
+                deviations=sd or [],
+                out=out,
+                force=force,
+            )
         )
     )
 
@@ -418,17 +421,17 @@ def plan(
     _end(
         lambda: run(
             Options(
-                focal,
-                camera_height,
-                base,
-                side,
-                depth,
-                step,
-                legs,
-                traverses,
-                sd or [],
-                want,
-                of,
+                focal=focal,
+                camera_height=camera_height,
+                base=base,
+                side=side,
+                depth=depth,
+                step=step,
+                legs=legs,
+                traverses=traverses,
+                deviations=sd or [],
+                want=want,
+                of=of,
             )
         )
     )
@@ -436,21 +439,21 @@ def plan(
 
 def _engine(name: Engine) -> Callable:
     from .commands.cluster import on_ray
-    from .commands.stream import here
+    from .commands.journal import here
 
     return {Engine.local: here, Engine.ray: on_ray}[name]
 
 
 def _end(work: Callable[[], bool]) -> None:
     """Do the work with compiled programs kept; the exit code says how it ended."""
-    from .reports.terminal import aborted
+    from .reports.terminal import abort
     from .xla import store
 
     store.use(store.default_folder())
     try:
         good = work()
     except KeyboardInterrupt:
-        aborted()
+        abort()
     except TableError as error:
         typer.secho(f"Error: {error}", err=True, fg="red")
         raise typer.Exit(2) from None

@@ -256,8 +256,8 @@ def clean_slabs(
 
 
 def map_batch(
-    function: Callable[[Pair], PyTree],
-    pairs: Pair,
+    function: Callable[[Any], PyTree],
+    pairs: Any,
     *,
     progress: Progress | None = None,
     threads: int | None = None,
@@ -291,7 +291,7 @@ def _searched_together(procedure: AbstractProcedure) -> int:
     return min([max(SUBSETS // block, 1) for block in blocks], default=1 << 16)
 
 
-def _chunk(pairs: Pair, chunk: int | None) -> int:
+def _chunk(pairs: Any, chunk: int | None) -> int:
     """Pairs per chunk, as given or by the number of points."""
     if pairs.x_left.ndim != 2:
         raise ValueError(
@@ -304,7 +304,7 @@ def _chunk(pairs: Pair, chunk: int | None) -> int:
     return min(128, 1 << fitting.bit_length() - 1)
 
 
-def _settings(pairs: Pair, lasting: dict[str, Any] | None = None) -> dict[str, Any]:
+def _settings(pairs: Any, lasting: dict[str, Any] | None = None) -> dict[str, Any]:
     """How to compile for so many pairs: the longer they take, the more is gained by
     what takes long to compile."""
     points = pairs.x_left.size
@@ -323,7 +323,7 @@ def _orient_slab(
     return map_chunks(lambda pair: read(pair, orient_once(pair, problem)), pairs, chunk)
 
 
-def _map_slab(pairs: Pair, *, function: Callable, chunk: int) -> PyTree:
+def _map_slab(pairs: Any, *, function: Callable, chunk: int) -> PyTree:
     return map_chunks(function, pairs, chunk)
 
 

@@ -1,47 +1,18 @@
-"""Pairs of every length in few batches, with what is asked of each."""
+"""Some of many pairs: those that are padded to one size, or those with some of their
+points."""
 
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Int, PyTree
 
-from ..geometry.pairs import Pair, stack
-from .padding import SIZES, sizes
+from .batch import map_batch
+from .padding import SIZES, Plan, sizes
+from .ragged import Ragged
 
-
-def each(
-    pairs: list[Pair],
-    one: Callable[[Pair], PyTree],
-    many: Callable[[Pair, Callable[[int, int], None]], PyTree],
-    progress: Callable[[int], None],
-    most: Callable[[int], int] = lambda size: sys.maxsize,
-) -> Iterator[tuple[int, PyTree]]:
-    """(index of the pair, its result in NumPy): one(pair) of a single pair, many(batch,
-    progress) of several.
-
-    Not in order, and padded. `most(points)`: pairs of so many points that go together
-    at most.
-    """
-    if len(pairs) == 1:
-        found = jax.tree.map(np.asarray, one(pairs[0]))
-        progress(1)
-        yield 0, found
-        return
-    finished = 0
-    for size, members in buckets([len(pair.x_left) for pair in pairs]).items():
-        step = min(len(members), most(size))
-        for begin in range(0, len(members), step):
-            part = members[begin : begin + step]
-            batch = jax.tree.map(np.asarray, stack([pairs[i] for i in part], size))
-            told = lambda done, total, before=finished: progress(
-                min(before + done, len(pairs))
-            )
-            found = jax.tree.map(np.asarray, many(_filled(batch, step), told))
-            finished += len(part)
-            for row, i in enumerate(part):
-                yield i, jax.tree.map(lambda a, row=row: a[row], found)
+Rows = Int[np.ndarray, " _"]
 
 
 def buckets(lengths: list[int], most: int = SIZES) -> dict[int, list[int]]:
@@ -53,11 +24,55 @@ def buckets(lengths: list[int], most: int = SIZES) -> dict[int, list[int]]:
     return {size: members for size, members in every.items() if members}
 
 
-def _filled(batch: Pair, count: int) -> Pair:
-    """The batch with empty pairs up to `count`: no program for the rest."""
-    missing = count - len(batch.x_left)
-    if not missing:
-        return batch
-    return jax.tree.map(
-        lambda a: np.concatenate([a, np.zeros((missing, *a.shape[1:]), a.dtype)]), batch
-    )
+def choose(pairs: Ragged, members: Rows, rows: Sequence[Rows]) -> Ragged:
+    """These pairs with these of their rows."""
+    flat = np.concatenate(rows)
+    values = {
+        name: column[members if name.startswith("focal") else flat]
+        for name, column in pairs._asdict().items()
+        if name != "begins"
+    }
+    return Ragged(begins=np.cumsum([0] + [len(own) for own in rows]), **values)
+
+
+def by_size(
+    pairs: Ragged, plan: Plan, most: Callable[[int], int]
+) -> Iterator[tuple[Rows, int]]:
+    """(numbers, size) of the pairs that are padded to one size of the plan, at most
+    `most(size)` of them together."""
+    place = np.searchsorted(plan.sizes, pairs.lengths)
+    for k, size in enumerate(plan.sizes):
+        members = np.flatnonzero(place == k)
+        for begin in range(0, len(members), most(size)):
+            yield members[begin : begin + most(size)], size
+
+
+def rows_of(pairs: Ragged, members: Rows) -> list[Rows]:
+    """The rows of each of these pairs."""
+    spans = zip(pairs.begins[members], pairs.begins[members + 1], strict=True)
+    return [np.arange(begin, end) for begin, end in spans]
+
+
+def map_ragged(
+    function: Callable[[Any], PyTree],
+    pairs: Ragged,
+    batch_of: Callable[[Rows, int], PyTree],
+    plan: Plan,
+    threads: int | None = None,
+) -> PyTree:
+    """function(...) of every pair, which tells something of its points, in the rows of
+    `pairs`. `batch_of(numbers, size)`: what `function` takes, of these pairs, padded."""
+    out: PyTree = None
+    slabs = dict(zip(plan.sizes, plan.slabs, strict=True))
+    for members, size in by_size(pairs, plan, lambda size: slabs[size]):
+        missing = slabs[size] - len(members)  # filled up: no other program for the rest
+        fill = lambda a, n=missing: np.pad(a, [(0, n)] + [(0, 0)] * (np.ndim(a) - 1))
+        batch = jax.tree.map(fill, batch_of(members, size))
+        found = jax.tree.map(np.asarray, map_batch(function, batch, threads=threads))
+        if out is None:
+            out = jax.tree.map(
+                lambda a: np.empty((len(pairs.x_left), *a.shape[2:]), a.dtype), found
+            )
+        own = [a[: len(members)] for a in jax.tree.leaves(found)]
+        pairs.gather(members, own, jax.tree.leaves(out))
+    return out

@@ -1,4 +1,4 @@
-"""Tables of any size on a cluster: the parts of `io.streaming`, worked on by actors of
+"""Tables of any size on a cluster: the parts of `stream`, worked on by actors of
 Ray Data.
 
 Every actor keeps its compiled programs, has a GPU to itself where the cluster has some,
@@ -17,7 +17,8 @@ from typing import Any
 
 from ..tables.fields import TableError
 from ..xla import store
-from .stream import Job, Part, Work, Worker
+from .journal import Job
+from .stream import Part, Work, Worker
 
 WAIT = 10.0
 """Seconds in which a cluster answers."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..reports import survey as report
-from ..reports.survey_files import Done, contents, finished
+from ..reports.survey_files import Done, calculate, contents
 from ..reports.terminal import consoles
 from ..surveys.planning import Deviations
 from ..tables import survey as tables, whole
@@ -36,9 +36,9 @@ def run(options: Options) -> bool:
     TableError, with nothing written."""
     if options.out is not None:
         whole.check_target(options.out, options.force)
-    named = prepared(options)
+    named = prepare(options)
     console, errors = consoles()
-    done = finished(named)
+    done = calculate(named)
     title = "the simulated plot" if options.file is None else str(options.file)
     report.show(console, done, title)
     texts: dict[str, Any] = {}
@@ -64,7 +64,7 @@ def run(options: Options) -> bool:
     return not (done.suspicious or done.doubtful)
 
 
-def prepared(options: Options) -> Named:
+def prepare(options: Options) -> Named:
     """Everything read and checked. Raises TableError."""
     deviations = deviations_of(options.deviations)
     if options.file is None:
@@ -87,9 +87,9 @@ def prepared(options: Options) -> Named:
             (example.TRAVERSES, tables.TRAVERSES),
         )
         readings, grid, traverses = (
-            (name, tables.rows(text, name, columns)) for text, columns in texts
+            tables.rows(text, name, columns) for text, columns in texts
         )
-        return tables.assembled(
+        return tables.assemble(
             readings, grid, traverses, example.CAMERA_HEIGHT, example.BASE, deviations
         )
     if options.grid is None:
@@ -114,7 +114,7 @@ def prepared(options: Options) -> Named:
         if options.traverses is None
         else tables.read(options.traverses, tables.TRAVERSES)
     )
-    return tables.assembled(readings, grid, traverses, camera_height, base, deviations)
+    return tables.assemble(readings, grid, traverses, camera_height, base, deviations)
 
 
 def positive(option: str, value: float | None) -> float:

@@ -18,27 +18,26 @@ from ..batches.padding import plan_for
 from ..batches.ragged import Ragged, concatenate
 from ..batches.table_noise import PAIRS
 from ..rejection import AbstractProcedure
+from ..reports.columns import TABLES
 from ..reports.pair import table as terminal_table
-from ..reports.records import TABLES, Recorder
-from ..reports.solutions import WARNED
 from ..reports.terminal import consoles, progress
 from ..tables import parquet, whole
-from ..tables.cameras import Cameras, check_one_sigma
-from ..tables.conversion import converted
+from ..tables.cameras import Cameras
+from ..tables.conversion import convert
 from ..tables.fields import TableError
-from . import orient as jobs, sigma as deviation
-from .orient import Options
-from .stream import (
-    CONVERTED,
-    JOURNAL,
-    MODIFIED,
-    PART_ROWS,
-    Job,
-    Work,
-    asked_before,
-    here,
-    parts,
+from ..tables.measured import to_ragged
+from . import sigma as deviation
+from .journal import JOURNAL, MODIFIED, Job, here, previous_request
+from .request import (
+    MEASURED,
+    SYSTEMS,
+    Options,
+    check_numbers,
+    read_cameras,
+    units_of,
 )
+from .solve import Task, is_good
+from .stream import CONVERTED, PART_ROWS, Work, parts
 from .tolerances import check_sigma, tolerances
 
 REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
@@ -74,19 +73,18 @@ def run(
     finished parts can be resumed."""
     started = time.monotonic()
     console, errors = consoles()
-    job = prepared(options, large, procedure)
+    job = prepare(options, large, procedure)
     told = "Cleaning" if procedure else "Orienting"
     try:
         with progress(errors, told, job.pairs) as tell:
             tell(job.done)
             for entry in large.engine(job, tell):
-                job.finished(entry)
-        _check_place(
-            job.target, options.force
-        )  # what may have appeared there meanwhile
+                job.add(entry)
+        # what may have appeared there meanwhile
+        _check_place(job.target, options.force)
         summary = job.end()
     except (OSError, parquet.pa.ArrowException) as error:
-        raise _refused(
+        raise _refusal(
             job.work.file, job.work.folder, error, "; what is finished --resume keeps"
         ) from None
     except KeyboardInterrupt:
@@ -102,16 +100,10 @@ def run(
 
 def good(summary: dict[str, Any]) -> bool:
     """Whether every pair is cleaned, where that was asked for, and usable."""
-    usable = sum(summary["results"].get(name, 0) for name in ("successful", *WARNED))
-    finished = (
-        summary["outcomes"].get("finished", 0)
-        if "outcomes" in summary
-        else summary["pairs"]
-    )
-    return usable == finished == summary["pairs"]
+    return is_good(summary["results"], summary.get("outcomes"))
 
 
-def prepared(
+def prepare(
     options: Options, large: Large, procedure: tuple[str, AbstractProcedure] | None
 ) -> Job:
     """The job, its journal begun or read. Raises TableError, and then leaves nothing
@@ -123,15 +115,7 @@ def prepared(
             found="nothing",
             expected="a table and --out DIR where results are Parquet tables",
         )
-    chosen = tuple(
-        name.strip()
-        for name in (large.tables or "elements,residuals,points").split(",")
-    )
-    for name in chosen:
-        if name not in TABLES:
-            raise TableError(
-                "--tables", found=repr(name), expected=f"some of {','.join(TABLES)}"
-            )
+    chosen = _tables(large.tables)
     whole.check_name(options.out, "a name for the folder of results")
     out = options.out.resolve()
     folder = out.with_name(f"{out.name}.unfinished")
@@ -139,28 +123,27 @@ def prepared(
         os.replace(out, folder)  # stopped when only its journal was left to be removed
     _check(options, out, folder, large.resume)
     stopped = None
-    if (
-        folder.exists() and not large.resume
-    ):  # kept until the table and all options are known to be good
+    if folder.exists() and not large.resume:
+        # kept until the table and all options are known to be good
         stopped = folder.with_name(f".{folder.name}.{os.getpid()}.old")
         os.replace(folder, stopped)
     try:
-        job = _planned(options, large, procedure, chosen, folder)
-        job.go_on() if large.resume and job.begun else job.begin()
+        job = _plan(options, large, procedure, chosen, folder)
+        job.go_on() if large.resume and job.has_journal else job.begin()
     except BaseException as error:
         if not large.resume:
             shutil.rmtree(folder, ignore_errors=True)
         if stopped is not None:
             os.replace(stopped, folder)
         if isinstance(error, OSError | parquet.pa.ArrowException):
-            raise _refused(options.file, folder, error) from None
+            raise _refusal(options.file, folder, error) from None
         raise
     if stopped is not None:
         shutil.rmtree(stopped)
     return job
 
 
-def _refused(
+def _refusal(
     file: Path, folder: Path, error: BaseException, more: str = ""
 ) -> TableError:
     """What the disk or a damaged table said."""
@@ -171,105 +154,87 @@ def _refused(
     return TableError(file, found=found, expected=expected)
 
 
-def _planned(
+def _tables(named: str | None) -> tuple[str, ...]:
+    """The tables by their names on the command line. Raises TableError."""
+    chosen = tuple(map(str.strip, (named or "elements,residuals,points").split(",")))
+    for name in chosen:
+        if name not in TABLES:
+            expected = f"some of {','.join(TABLES)}"
+            raise TableError("--tables", found=repr(name), expected=expected)
+    return chosen
+
+
+def _plan(
     options: Options,
     large: Large,
     procedure: tuple[str, AbstractProcedure] | None,
     chosen: tuple[str, ...],
     folder: Path,
 ) -> Job:
+    """The job that is asked for; a CSV table is converted first."""
     assert options.file is not None and options.out is not None
     source = options.file
     if not whole.is_parquet(source):
         source = folder / CONVERTED
         if not (large.resume and source.exists() and (folder / JOURNAL).exists()):
             folder.mkdir(parents=True, exist_ok=True)
-            converted(options.file, source)
+            convert(options.file, source)
     table = parquet.Source(source, options.file)
-    system = jobs.SYSTEMS[options.elements or "relative"]
-    jobs.check_numbers(options, table.has_sigma, str(options.file), system)
+    system = SYSTEMS[options.elements or "relative"]
+    check_numbers(options, table.has_sigma, str(options.file), system)
     known = table.has_sigma or options.sigma is not None
     if procedure is not None:
         check_sigma(*procedure, known)
     scan = table.scan()
-    cameras = jobs.read_cameras(options, jobs.MEASURED)
-    _check_cameras(cameras, scan, table, known)
+    cameras = read_cameras(options, MEASURED)
+    cameras.of_all(
+        scan.names,
+        str(table.path),
+        one_sigma=known,
+        place=lambda number: table.place(int(scan.begins[number])),
+    )
     noise = None
     if options.sigma == deviation.AUTO:
-        before = deviation.from_entry(asked_before(folder)) if large.resume else None
+        before = (
+            deviation.from_entry(previous_request(folder)) if large.resume else None
+        )
         noise = before or deviation.from_residuals(_sample(table, scan, cameras))
-    sigma = deviation.stated(options.sigma) if noise is None else noise.sigma
+    sigma = deviation.parse(options.sigma) if noise is None else noise.sigma
     pieces = parts(scan.begins, large.part_rows)
-    keywords = {
-        "elements": system,
-        "base": options.base,
-        "residual": jobs.RESIDUALS[options.residual],
-    }
-    order = tuple(name for name in TABLES if name in ("elements", *chosen))
-    if procedure and "residuals" not in order:
-        order = (*order[:1], "residuals", *order[1:])
-    request = _request(
-        replace(options, sigma=sigma), order, procedure
-    ) | deviation.entry(noise)
-    work = Work(
-        source.absolute(),
-        options.file,
-        folder,
-        plan_for(scan.lengths, len(pieces)),
-        cameras,
-        sigma,
-        Recorder(system, order, known, procedure is not None),
-        keywords,
-        jobs.units_of(options, table.has_sigma, system),
-        procedure[1] if procedure else None,
+    wanted = {"elements", *chosen} | ({"residuals"} if procedure else set())
+    task = Task(
+        system=system,
+        tables=tuple(name for name in TABLES if name in wanted),
+        sigma_known=known,
+        base=options.base,
+        residual=options.residual,
+        procedure=procedure[1] if procedure else None,
     )
-    return Job(work, pieces, options.out.resolve(), request)
+    asked = _request(replace(options, sigma=sigma), task.tables, procedure)
+    single = len(scan.names) == 1
+    work = Work(
+        source=source.absolute(),
+        file=options.file,
+        folder=folder,
+        plan=None if single else plan_for(scan.lengths, len(pieces)),
+        cameras=cameras,
+        sigma=sigma,
+        task=task,
+        units=units_of(options, table.has_sigma, system),
+    )
+    return Job(work, pieces, options.out.resolve(), asked | deviation.entry(noise))
 
 
 def _sample(table: parquet.Source, scan: parquet.Scan, cameras: Cameras) -> Ragged:
-    """The pairs whose residuals tell sigma: all of a small table, else PLACES runs of
-    them, evenly spread."""
+    """The pairs whose residuals tell sigma, which is their unit: all of a small table,
+    else PLACES runs of them, evenly spread."""
     count = len(scan.begins) - 1
     run, places = (count, 1) if count <= PAIRS else (PAIRS // PLACES, PLACES)
-    firsts = np.linspace(0, count - run, places).astype(int)
-    return concatenate(
-        [
-            _rows(table, scan.begins[first : first + run + 1], cameras)
-            for first in firsts
-        ]
-    )
-
-
-def _rows(table: parquet.Source, begins: np.ndarray, cameras: Cameras) -> Ragged:
-    """Pairs of the table whose standard deviations are its unit."""
-    rows = table.rows(int(begins[0]), int(begins[-1]))
-    own = begins - begins[0]
-    names = parquet.names(rows, own[:-1], str(table.path))
-    return parquet.ragged(rows, own, cameras.of_all(names, str(table.path)), 1.0)
-
-
-def _check_cameras(
-    cameras: Cameras, scan: parquet.Scan, table: parquet.Source, sigma: bool
-) -> None:
-    """Raises TableError for a pair without cameras, or with two that one sigma cannot
-    serve."""
-    one_for_all = cameras.left is not None and cameras.right is not None
-    names = (
-        scan.names.slice(0, 1).to_pylist() if one_for_all else scan.names.to_pylist()
-    )
-    for name, row in zip(names, scan.begins[:-1].tolist(), strict=False):
-        try:
-            both = cameras.of(str(name), str(table.path))
-            if sigma:
-                check_one_sigma(str(table.path), None, *both)
-        except TableError as error:
-            raise TableError(
-                error.file,
-                line=table.place(row),
-                column=error.column,
-                found=error.found,
-                expected=error.expected,
-            ) from None
+    runs = []
+    for first in np.linspace(0, count - run, places).astype(int):
+        part = table.read(scan.begins[first : first + run + 1])
+        runs.append(to_ragged(part, cameras.of_all(part.names, part.file), 1.0))
+    return concatenate(runs)
 
 
 def _check(options: Options, out: Path, folder: Path, resume: bool) -> None:
@@ -386,7 +351,7 @@ def show(console: Console, job: Job, summary: dict[str, Any], seconds: float) ->
     rate = f"{pairs}, {summary['rows']:,} points in {seconds:.1f} s"
     tables = ", ".join(
         name
-        for name in (*job.work.recorder.tables, "cleaned")
+        for name in (*job.work.task.tables, "cleaned")
         if (job.target / name).exists()
     )
     console.print(

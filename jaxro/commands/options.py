@@ -142,6 +142,47 @@ Seed = Annotated[
     typer.Option(help="Seed of the random numbers.", metavar="S", min=0, max=2**63 - 1),
 ]
 
+OrientedFiles = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder for elements.csv, residuals.csv, points.csv, reliability.csv, "
+        "summary.json.",
+        metavar="DIR",
+        show_default=False,
+    ),
+]
+CleanedFiles = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder for cleaned.csv (every row with its verdict), decisions.csv "
+        "and decisions.json (how it came "
+        "about), and of the points kept the files of `jaxro orient`.",
+        metavar="DIR",
+        show_default=False,
+    ),
+]
+WrongPoints = Annotated[
+    str, typer.Option(help="Numbers of wrong points.", metavar="N,N,...")
+]
+ErrorSizes = Annotated[
+    str, typer.Option(help="Sizes of their errors, in sigma.", metavar="K,K,...")
+]
+Trials = Annotated[
+    int, typer.Option(help="Simulated pairs in every setting.", metavar="T")
+]
+FalseAlarms = Annotated[
+    float,
+    typer.Option(
+        help="Share of pairs without errors that lose a point in the comparison at "
+        "equal terms; 0: without it.",
+        metavar="P",
+    ),
+]
+
+ForceFile = Annotated[
+    bool, typer.Option("--force", help="Overwrite the file of --out.")
+]
+
 GridTable = Annotated[
     Path | None,
     typer.Option(

@@ -45,7 +45,7 @@ class Options:
 def run(options: Options) -> bool:
     """Calculate and show. Raises TableError, also where a wanted accuracy cannot be
     reached."""
-    plan, deviations = planned(options)
+    plan, deviations = read_plan(options)
     console, _ = consoles()
     told = jax.tree.map(float, planning.expected_accuracy(plan, deviations))
     base = float(np.asarray(plan.base))
@@ -57,7 +57,7 @@ def run(options: Options) -> bool:
         markup=False,
     )
     rows = table("expected standard deviation of", "mm", "H / m")
-    for what, value in zip(named(options), told, strict=True):
+    for what, value in zip(labels(options), told, strict=True):
         rows.add_row(
             what,
             number(value, 2),
@@ -66,12 +66,12 @@ def run(options: Options) -> bool:
     console.print(rows)
     console.print(_budget(plan, deviations))
     if options.want is not None:
-        for line in _needed(options, plan, deviations, options.want):
+        for line in _needs(options, plan, deviations, options.want):
             console.print(line, markup=False)
     return True
 
 
-def named(options: Options) -> list[str]:
+def labels(options: Options) -> list[str]:
     """The quantities in words."""
     counted = lambda count, what: (
         f"{count} {what}" if count == 1 else f"{count} {what}s"
@@ -83,7 +83,7 @@ def named(options: Options) -> list[str]:
     return [what.format(legs=legs, traverses=traverses) for what in QUANTITIES.values()]
 
 
-def planned(options: Options) -> tuple[Plan, Deviations]:
+def read_plan(options: Options) -> tuple[Plan, Deviations]:
     """The plan, checked. Raises TableError."""
     lengths = {
         "--focal": options.focal,
@@ -120,14 +120,14 @@ def planned(options: Options) -> tuple[Plan, Deviations]:
     if options.want is not None:
         positive("--want", options.want)
     plan = Plan(
-        focal,
-        camera_height,
-        base,
-        side,
-        options.depth,
-        options.step,
-        options.legs,
-        options.traverses,
+        focal=focal,
+        camera_height=camera_height,
+        base=base,
+        side=side,
+        depth=options.depth,
+        step=options.step,
+        legs=options.legs,
+        traverses=options.traverses,
     )
     return plan, deviations_of(options.deviations)
 
@@ -161,13 +161,13 @@ def _budget(plan: Plan, deviations: Deviations):
     return rows
 
 
-def _needed(
+def _needs(
     options: Options, plan: Plan, deviations: Deviations, want: float
 ) -> list[str]:
     """What the wanted accuracy needs. Raises TableError where nothing gives it."""
     place = list(QUANTITIES).index(options.of)
     of = lambda expected: expected[place]
-    what = f"± {want:g} mm of {named(options)[place]}"
+    what = f"± {want:g} mm of {labels(options)[place]}"
     base = float(planning.base_needed(plan, deviations, want, of))
     now = float(np.asarray(plan.base))
     highest = {

@@ -6,7 +6,6 @@ from typing import Any
 
 from ..batches.ragged import Ragged
 from ..batches.table_noise import TableNoise, estimate
-from ..geometry.pairs import Pair
 from ..reports.pair import digits
 from ..reports.text import number
 from ..tables.fields import TableError
@@ -17,7 +16,7 @@ Sigma = float | str | None
 """As it was given; None where nothing was said."""
 
 
-def stated(sigma: Sigma) -> float | None:
+def parse(sigma: Sigma) -> float | None:
     """The number; None for `auto` and where nothing was said. Raises TableError for
     anything else."""
     if sigma is None or sigma == AUTO:
@@ -36,7 +35,7 @@ def stated(sigma: Sigma) -> float | None:
     return value
 
 
-def from_residuals(pairs: list[Pair] | Ragged) -> TableNoise:
+def from_residuals(pairs: Ragged) -> TableNoise:
     """The noise of the pairs, whose sigma is one unit of the table. Raises TableError
     where they do not tell it."""
     try:

@@ -17,13 +17,14 @@ from ..geometry.pairs import Pair, pad
 from ..orientation.orient import orient
 from ..rejection import PROCEDURES
 from ..reports import files
-from ..reports.solutions import ADVICE, NAMES
+from ..reports.columns import RESULT_ADVICE, RESULT_NAMES
 from ..reports.terminal import consoles, progress
 from ..tables import whole
 from ..tables.fields import TableError
+from ..tables.measured import one_pair
 from . import orient as jobs, sigma as deviation
-from .clean import named
-from .orient import Options
+from .clean import find_procedure
+from .request import Options
 
 SIGMA = 0.01
 """mm, of the standard layout, as in the papers."""
@@ -72,7 +73,9 @@ def reproduce(name: str, trials: int | None, seed: int | None) -> bool:
 def run_comparison(options: Options, wanted: Wanted) -> bool:
     """Compare procedures on the layout of the first pair of the file, or the standard
     one. Raises TableError."""
-    procedures = {name: named(name) for name in wanted.procedures or PROCEDURES}
+    procedures = {
+        name: find_procedure(name) for name in wanted.procedures or PROCEDURES
+    }
     errors = _numbers("--errors", wanted.errors, int)
     sizes = _numbers("--size", wanted.sizes, float)
     _check_trials(wanted.trials)
@@ -117,19 +120,19 @@ def layouts_of(options: Options, warnings: Any) -> dict[str, Pair]:
     simulated coordinates."""
     if options.file is None:
         return _standard(options)
-    job = jobs.prepared(options)
+    job = jobs.prepare(options)
     jobs.warn(warnings, job)
-    measured, pair = job.table.pairs[0], job.pairs[0]
+    measured, pair = job.table.pairs[0], one_pair(job.pairs, 0)
     solved = orient(pair)
     if not bool(solved.usable):
-        advice = ADVICE[NAMES[int(solved.result._value)]]
+        advice = RESULT_ADVICE[RESULT_NAMES[int(solved.result._value)]]
         raise TableError(
             job.table.file,
             line=measured.lines[0],
             found=f"pair {measured.name!r}: {advice}",
             expected="usable elements",
         )
-    sigma = pair.sigma if job.sigma_known else pair.sigma * solved.sigma0
+    sigma = pair.sigma if job.task.sigma_known else pair.sigma * solved.sigma0
     if not float(jnp.max(sigma)) > 0:
         raise TableError(
             "--sigma",
@@ -168,7 +171,7 @@ def _standard(options: Options) -> dict[str, Pair]:
                 found="it without FILE.csv",
                 expected="the table that it belongs to",
             )
-    given = deviation.stated(options.sigma)
+    given = deviation.parse(options.sigma)
     sigma = SIGMA if given is None else given
     rows = mock_pairs.mock_pair(mock_pairs.row_layout())
     eight = pad(

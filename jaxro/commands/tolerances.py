@@ -41,7 +41,7 @@ def tolerances(part: Any) -> dict[str, Number]:
     return found
 
 
-def changed(procedure: AbstractProcedure, changes: list[str]) -> AbstractProcedure:
+def change(procedure: AbstractProcedure, changes: list[str]) -> AbstractProcedure:
     """The procedure after changes such as eps3=0.05; the part may be left out where
     only one has such a number.
 

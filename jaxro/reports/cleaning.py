@@ -5,93 +5,72 @@ from collections import defaultdict
 from rich.console import Console
 from rich.markup import escape
 
-from .pair import MOST_ROWS
+from .columns import OUTCOME_ADVICE
+from .pair import MOST_ROWS, join_names
 from .text import number, table
-from .verdicts import ADVICE, Verdict
+from .verdicts import Verdicts
 
 
-def show(console: Console, verdicts: list[Verdict], procedure: str, unit: str) -> None:
+def show(console: Console, verdicts: Verdicts, procedure: str, unit: str) -> None:
     """One pair, or many with the name of the pair in every row."""
-    rejected, points = (
-        sum(len(v.rejected) for v in verdicts),
-        sum(len(v.measured.points) for v in verdicts),
-    )
-    many = len(verdicts) > 1
-    of = f"{len(verdicts)} pairs" if many else verdicts[0].measured.name
+    names, rejected = verdicts.table.names, len(verdicts.rejected)
+    many = len(names) > 1
     console.print(
-        f"[bold]Cleaning of {escape(of)}[/bold] by {procedure}: {rejected} of {points} "
-        "points rejected"
+        f"[bold]Cleaning of {f'{len(names)} pairs' if many else escape(names[0])}[/bold] "
+        f"by {procedure}: {rejected} of {len(verdicts.table.points)} points rejected"
     )
     if rejected:
-        _rejections(console, verdicts, rejected, unit)
-    _doubts(console, verdicts)
-    outcomes: dict[str, list[str]] = defaultdict(list)
-    for v in verdicts:
-        outcomes[v.outcome].append(v.measured.name)
-    for outcome, names in outcomes.items():
+        _show_rejections(console, verdicts, unit)
+    _show_doubts(console, verdicts)
+    by_outcome: dict[str, list[str]] = defaultdict(list)
+    for name, outcome in zip(names, verdicts.outcomes, strict=True):
+        by_outcome[outcome].append(name)
+    for outcome, members in by_outcome.items():
+        plural = "s" * (len(members) != 1)
+        counted = f" ({len(members)} pair{plural})" if many else ""
         if outcome == "finished":
-            console.print(
-                f"[green]finished[/green]{f' ({_pairs(names)})' if many else ''}"
-            )
+            console.print(f"[green]finished[/green]{counted}")
         else:
-            listed = ", ".join(map(escape, names[:MOST_ROWS])) + (
-                ", ..." if len(names) > MOST_ROWS else ""
-            )
-            of = f" ({_pairs(names)})" if many else ""
             console.print(
-                f"[bold red]{outcome.upper()}[/bold red] {listed}{of}: "
-                f"{ADVICE[outcome]}"
+                f"[bold red]{outcome.upper()}[/bold red] "
+                f"{join_names(members, MOST_ROWS)}{counted}: {OUTCOME_ADVICE[outcome]}"
             )
     console.print()
 
 
-def _pairs(names: list[str]) -> str:
-    return f"{len(names)} pair{'s' * (len(names) != 1)}"
-
-
-def _rejections(
-    console: Console, verdicts: list[Verdict], count: int, unit: str
-) -> None:
-    many = len(verdicts) > 1
+def _show_rejections(console: Console, verdicts: Verdicts, unit: str) -> None:
+    owner, found = verdicts.table.owners, verdicts.of_points
+    many = len(verdicts.table.names) > 1
     first = ("pair", "point") if many else ("point",)
     rows = table(*first, "order", "statistic", "limit", f"q [{unit}]", left=len(first))
-    for v in verdicts:
-        for i in v.rejected:
-            if rows.row_count == MOST_ROWS:
-                break
-            d = v.decision
-            names = [v.measured.name] * many + [v.measured.points[i]]
-            evidence = [_evidence(float(x)) for x in (d.statistic[i], d.limit[i])]
-            rows.add_row(
-                *map(escape, names),
-                str(int(d.order[i])),
-                *evidence,
-                number(float(v.parallax[i]), 4),
-            )
+    for row in verdicts.rejected[:MOST_ROWS]:
+        pair, point = verdicts.table.names[owner[row]], verdicts.table.points[row]
+        rows.add_row(
+            *map(escape, (pair, point) if many else (point,)),
+            str(found["order"][row]),
+            f"{found['statistic'][row]:.4g}",
+            f"{found['limit'][row]:.4g}",
+            number(found["q"][row], 4),
+        )
     console.print(
         "Statistic against its limit, and q at the orientation of the points kept:"
     )
     console.print(rows)
+    count = len(verdicts.rejected)
     if count > MOST_ROWS:
         console.print(f"{MOST_ROWS} of {count} rejections; --out DIR writes all.")
 
 
-def _doubts(console: Console, verdicts: list[Verdict]) -> None:
+def _show_doubts(console: Console, verdicts: Verdicts) -> None:
     """Of which points one is wrong, by pair."""
-    doubtful = [v for v in verdicts if v.undecided]
-    for v in doubtful[:MOST_ROWS]:
-        of = f"{v.measured.name}: " if len(verdicts) > 1 else ""
+    doubtful, names = verdicts.undecided, verdicts.table.names
+    for pair in list(doubtful)[:MOST_ROWS]:
+        of = f"{names[pair]}: " if len(names) > 1 else ""
         console.print(
-            f"{of}wrong is one of {', '.join(v.undecided)}; nothing tells which.",
+            f"{of}wrong is one of {', '.join(doubtful[pair])}; nothing tells which.",
             markup=False,
         )
     if len(doubtful) > MOST_ROWS:
         console.print(
             f"{MOST_ROWS} of {len(doubtful)} undecided pairs; --out DIR writes all."
         )
-
-
-def _evidence(value: float) -> str:
-    """Statistics are millimetres, ratios or squares: as many decimals as four digits
-    need."""
-    return f"{value:.4g}"

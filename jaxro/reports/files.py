@@ -1,9 +1,6 @@
 """The files of --out, in full precision: elements.csv, residuals.csv, points.csv,
 reliability.csv and summary.json.
 
-All or none in a new folder; in one that is there each file takes the place of the old
-one when all are written.
-
 A number is written as its shortest text that reads back as the same float. What does
 not exist is an empty cell, null in JSON. Headers carry the units; angles are degrees.
 """
@@ -12,104 +9,72 @@ import csv
 import io
 import json
 import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from ..assessment import Pattern
-from . import reliability as reading
-from .solutions import Element, Solution, Units, pattern_of_all, with_pattern
+from ..geometry.pairs import Camera
+from ..tables.measured import to_list
+from .columns import TABLES, Column, Units, head
+from .model import Element, One, Results
 
 
-def texts(
-    solved: list[Solution], units: Units, summary: dict[str, Any]
-) -> dict[str, str]:
+def texts(results: Results, summary: dict[str, Any]) -> dict[str, str]:
     """The content of the files by name."""
-    return {
-        "elements.csv": csv_text(_element_rows(solved, units)),
-        "residuals.csv": csv_text(_point_rows(solved, RESIDUALS, units)),
-        "points.csv": csv_text(_point_rows(solved, POINTS, units)),
-        "reliability.csv": csv_text(reading.file_rows(solved, units)),
-        "summary.json": _json(solved, units, summary),
+    written = {
+        f"{name}.csv": table_text(*results.written(name), results.units)
+        for name in TABLES
     }
+    return written | {"summary.json": _summary(results, summary)}
 
 
-RESIDUALS = (
-    "q",
-    "v_x_left",
-    "v_y_left",
-    "v_x_right",
-    "v_y_right",
-    "redundancy",
-    "in_front",
-)
-POINTS = ("X", "Y", "Z")
-
-
-def _element_rows(solved: list[Solution], units: Units) -> list[list[Any]]:
-    header: list[Any] = ["pair", "result", "points", "degrees_of_freedom", "iterations"]
-    for e in solved[0].elements:
-        header += [head(e.name, e.unit)] + (
-            [] if e.deviation is None else [head(f"sd_{e.name}", e.unit)]
-        )
-    rows: list[list[Any]] = [
-        [*header, head("m_q", units.photo), head("sigma0", units.sigma0), "advice"]
+def table_text(columns: Sequence[Column], values: dict[str, Any], units: Units) -> str:
+    """Columns as CSV text; those without values are left out."""
+    there = [
+        column
+        for column in columns
+        if column.only in ("", "csv") and (column.source or column.name) in values
     ]
-    for s in solved:
-        row = [s.measured.name, s.result, len(s.measured.points), *_counts(s).values()]
-        for e in s.elements:
-            row += [e.value] + ([] if e.deviation is None else [e.deviation])
-        rows.append([*row, s.m_q, s.sigma0, s.advice])
-    return rows
+    cells = [_cells(column, values[column.source or column.name]) for column in there]
+    header = [column.head(units) for column in there]
+    return csv_text([header, *zip(*cells, strict=True)])
 
 
-def _point_rows(
-    solved: list[Solution], keys: tuple[str, ...], units: Units
-) -> list[list[Any]]:
-    unit = {"redundancy": "", "in_front": "", **dict.fromkeys(POINTS, units.model)}
-    rows: list[list[Any]] = [
-        ["pair", "point", *(head(key, unit.get(key, units.photo)) for key in keys)]
-    ]
-    for s in solved:
-        rows += [
-            [s.measured.name, values["point"], *(values[key] for key in keys)]
-            for values in s.points
-        ]
-    return rows
+def _cells(column: Column, values: Any) -> list[Any]:
+    """The values of a column as Python objects: None for what CSV text leaves empty."""
+    found = to_list(values)
+    if column.names:
+        return [column.names.get(number) for number in found]
+    if column.infinity:
+        return [column.infinity if v == math.inf else v for v in found]
+    if isinstance(values, np.ndarray) and values.dtype.kind == "i":
+        truth = {1: True, 0: False} if values.dtype == np.int8 else {}
+        return [None if value < 0 else truth.get(value, value) for value in found]
+    return found
 
 
-def head(name: str, unit: str) -> str:
-    """The header of a column."""
-    return f"{name}_{unit}" if unit else name
+def csv_text(rows: Iterable[Sequence[Any]]) -> str:
+    """Rows as CSV text, the first of them the header: true and false for truths, an
+    empty field for what does not exist."""
 
+    def cell(value: Any) -> Any:
+        if isinstance(value, bool):
+            return str(value).lower()
+        return value if _exists(value) else ""
 
-def _counts(s: Solution) -> dict[str, int]:
-    o = s.orientation
-    return {
-        "degrees_of_freedom": int(o.degrees_of_freedom),
-        "iterations": int(o.iterations),
-    }
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows(map(cell, row) for row in rows)
+    return text.getvalue()
 
 
 def _exists(value: Any) -> bool:
     return value is not None and not (
         isinstance(value, float) and not math.isfinite(value)
     )
-
-
-def csv_text(rows: list[list[Any]]) -> str:
-    """Rows as CSV, the first of them the header."""
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(
-        [
-            str(value).lower()
-            if isinstance(value, bool)
-            else value
-            if _exists(value)
-            else ""
-            for value in row
-        ]
-        for row in rows
-    )
-    return text.getvalue()
 
 
 def _pattern(pattern: Pattern | None, units: Units) -> dict[str, float] | None:
@@ -124,45 +89,48 @@ def _pattern(pattern: Pattern | None, units: Units) -> dict[str, float] | None:
     return {name: float(value) for name, value in told.items()}
 
 
-def _json(solved: list[Solution], units: Units, summary: dict[str, Any]) -> str:
-    tested = {id(s) for s in with_pattern(solved)}
-    pairs = [
-        {
-            "pair": s.measured.name,
-            "result": s.result,
-            "usable": s.usable,
-            "advice": s.advice,
-            "points": len(s.measured.points),
-            **_counts(s),
-            "m_q": s.m_q,
-            "sigma0": s.sigma0,
-            "elements": {e.name: _element(e) for e in s.elements},
-            "correlations": s.correlations,
-            "pattern": _pattern(s.pattern if id(s) in tested else None, units),
-            "cameras": [
-                {
-                    "focal": c.focal,
-                    "principal_point": list(c.principal_point),
-                    "pixel_size": c.pixel_size,
-                    "y_down": c.y_down,
-                }
-                for c in s.cameras
-            ],
-        }
-        for s in solved
-    ]
-    whole = {
-        **summary,
-        "units": {
-            "photo": units.photo,
-            "model": units.model,
-            "sigma0": units.sigma0 or None,
-            "angles": "deg",
-        },
-        "pattern": _pattern(pattern_of_all(solved), units),
-        "pairs": pairs,
+def _summary(results: Results, summary: dict[str, Any]) -> str:
+    """The content of summary.json."""
+    units = asdict(results.units) | {
+        "sigma0": results.units.sigma0 or None,
+        "angles": "deg",
     }
-    return json_text(whole)
+    return json_text(
+        {
+            **summary,
+            "units": units,
+            "pattern": _pattern(results.pattern, results.units),
+            "pairs": [_pair(one) for one in results],
+        }
+    )
+
+
+def _pair(one: One) -> dict[str, Any]:
+    """What summary.json says of a pair."""
+    return {
+        "pair": one.name,
+        "result": one.result,
+        "usable": one.usable,
+        "advice": one.advice,
+        "points": one.count,
+        "degrees_of_freedom": one.value("degrees_of_freedom"),
+        "iterations": one.value("iterations"),
+        "m_q": one.value("m_q"),
+        "sigma0": one.value("sigma0"),
+        "elements": {e.name: _element(e) for e in one.elements},
+        "correlations": one.correlations,
+        "pattern": _pattern(one.pattern, one.results.units),
+        "cameras": [_camera(camera) for camera in one.cameras],
+    }
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return {
+        "focal": camera.focal,
+        "principal_point": list(camera.principal_point),
+        "pixel_size": camera.pixel_size,
+        "y_down": camera.y_down,
+    }
 
 
 def _element(e: Element) -> dict[str, Any]:

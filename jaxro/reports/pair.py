@@ -3,14 +3,16 @@ find, in tables."""
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable
+from typing import Any, SupportsFloat
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .solutions import Solution, Units
+from ..tables.measured import COORDINATES
+from .model import One, Results
 from .text import number
 
 MOST_ROWS = 40
@@ -19,140 +21,121 @@ MOST_ROWS = 40
 HIGH = 0.95
 """Correlations of elements above this are named."""
 
+CORRECTIONS = tuple(f"v_{name}" for name in COORDINATES)
+AXES = ("X", "Y", "Z")
 
-def show(console: Console, solved: list[Solution], units: Units, subtitle: str) -> None:
+
+def show(console: Console, results: Results, subtitle: str) -> None:
     """One pair in full, or many as one row each."""
-    if len(solved) == 1:
-        _one(console, solved[0], units, subtitle)
+    if len(results) == 1:
+        _show_one(console, One(results, 0), subtitle)
     else:
-        _many(console, solved, units, subtitle)
+        _show_many(console, results, subtitle)
 
 
-def _one(console: Console, s: Solution, units: Units, subtitle: str) -> None:
-    o = s.orientation
+def _show_one(console: Console, one: One, subtitle: str) -> None:
+    units = one.results.units
     console.print(
-        f"[bold]Relative orientation of {escape(s.measured.name)}[/bold], "
-        f"{len(s.measured.points)} points"
+        f"[bold]Relative orientation of {escape(one.name)}[/bold], {one.count} points"
     )
-    console.print(_cameras(s, units) + subtitle)
-    console.print(_verdict(s))
-    if s.usable:
-        asked = () if s.interval is None else (f"± {100 * s.interval.confidence:g} %",)
-        elements = table("element", "value", "± sd", *asked, "unit")
-        for e in s.elements:
-            decimals = digits(e.deviation)
-            sd = "given" if e.deviation is None else number(e.deviation, decimals)
-            wide = "" if e.half_width is None else number(e.half_width, decimals)
-            elements.add_row(
-                e.name,
-                number(e.value, decimals),
-                sd,
-                *(wide for _ in asked),
-                _unit(e.unit),
-            )
-        console.print(elements)
-        sigma0 = f"sigma0 {number(s.sigma0, digits(s.sigma0))}" + (
-            f" {units.sigma0}" if units.sigma0 else ""
+    console.print(_cameras(one) + subtitle)
+    console.print(_verdict(one))
+    if one.usable:
+        console.print(_elements(one))
+        sigma0, m_q = one.value("sigma0"), one.value("m_q")
+        freedom, rounds = one.value("degrees_of_freedom"), one.value("iterations")
+        accuracy = f"sigma0 {number(sigma0, digits(sigma0))} {units.sigma0}".rstrip()
+        console.print(
+            f"{accuracy}   m_q {number(m_q, digits(m_q))} {units.photo}   "
+            f"{freedom} degree{'s' * (freedom != 1)} of freedom   "
+            f"{rounds} iteration{'s' * (rounds != 1)}"
         )
-        m_q = f"m_q {number(s.m_q, digits(s.m_q))} {units.photo}"
-        freedom, rounds = int(o.degrees_of_freedom), int(o.iterations)
-        counted = (
-            f"{freedom} degree{'s' * (freedom != 1)} of freedom   {rounds} "
-            f"iteration{'s' * (rounds != 1)}"
-        )
-        console.print(f"{sigma0}   {m_q}   {counted}")
-        high = {pair: r for pair, r in s.correlations.items() if abs(r) > HIGH}
-        named = (
-            ", ".join(f"{pair} {100 * r:.1f} %" for pair, r in high.items()) or "none"
-        )
-        local = " (rx ry rz: turns of the right photo, b1 b2: of the base)" * bool(
-            high and "rx/ry" in s.correlations
-        )
-        console.print(f"Correlations over {HIGH:.0%}: {named}{local}")
-    _points(console, s, units)
+        console.print(_correlations(one))
+    _show_points(console, one)
 
 
-def _points(console: Console, s: Solution, units: Units) -> None:
-    points = s.points
-    if points[0]["in_front"] is None:
+def _elements(one: One) -> Table:
+    """The elements with their standard deviations and, if asked for, intervals."""
+    confidence = one.results.confidence
+    asked = () if confidence is None else (f"± {100 * confidence:g} %",)
+    rows = table("element", "value", "± sd", *asked, "unit")
+    for e in one.elements:
+        decimals = digits(e.deviation)
+        sd = "given" if e.deviation is None else number(e.deviation, decimals)
+        wide = "" if e.half_width is None else number(e.half_width, decimals)
+        value = number(e.value, decimals)
+        rows.add_row(e.name, value, sd, *(wide for _ in asked), unit_name(e.unit))
+    return rows
+
+
+def _correlations(one: One) -> str:
+    """The elements that are highly correlated."""
+    every = one.correlations
+    high = {pair: r for pair, r in every.items() if abs(r) > HIGH}
+    named = ", ".join(f"{pair} {100 * r:.1f} %" for pair, r in high.items()) or "none"
+    local = " (rx ry rz: turns of the right photo, b1 b2: of the base)"
+    explained = local if high and "rx/ry" in every else ""
+    return f"Correlations over {HIGH:.0%}: {named}{explained}"
+
+
+def _show_points(console: Console, one: One) -> None:
+    """Residuals and model coordinates of the points, where there are any."""
+    units, residuals = one.results.units, one.of_points("residuals")
+    if not one.count or residuals["in_front"][0] < 0:
         return
-    corrections = ("v_x_left", "v_y_left", "v_x_right", "v_y_right")
-    heads = ("q", "v xl", "v yl", "v xr", "v yr", "r", "X", "Y", "Z")
-    rows = table("point", *(heads if s.usable else heads[:6]), title=_legend(s, units))
-    size = _rms(p["q"] for p in points)
-    photo = digits(max(size, _rms(p[v] for p in points for v in corrections)), 1)
-    model = (
-        max(
-            0,
-            min(
-                6,
-                5
-                - math.floor(
-                    math.log10(_rms(p[a] for p in points for a in "XYZ") or 1.0)
-                ),
-            ),
-        )
-        - 1
-    )
-    for p in worst(points, lambda p: (p["in_front"], -abs(p["q"]))):
-        cells = [number(p[key], photo) for key in ("q", *corrections)] + [
-            number(p["redundancy"], 2)
-        ]
-        cells += [number(p[a], max(model, 0)) for a in "XYZ"] if s.usable else []
-        rows.add_row(escape(p["point"]), *cells, style=None if p["in_front"] else "red")
+    model, q = one.of_points("points"), residuals["q"]
+    front = residuals["in_front"] > 0
+    photo = digits(max(_rms(q), _rms([residuals[v] for v in CORRECTIONS])), 1)
+    extent = _rms([model[axis] for axis in AXES]) or 1.0
+    decimals = max(min(6, 5 - math.floor(math.log10(extent))) - 1, 0)
+    heads = ("q", "v xl", "v yl", "v xr", "v yr", "r", *(AXES if one.usable else ()))
+    named = f", model X Y Z [{unit_name(units.model)}]" if one.usable else ""
+    title = f"y-parallax q and corrections v [{units.photo}], redundancy r{named}"
+    rows = table("point", *heads, title=title)
+    for i in worst(list(range(one.count)), lambda i: (front[i], -abs(q[i]))):
+        cells = [number(residuals[key][i], photo) for key in ("q", *CORRECTIONS)]
+        cells.append(number(residuals["redundancy"][i], 2))
+        if one.usable:
+            cells += [number(model[axis][i], decimals) for axis in AXES]
+        rows.add_row(escape(one.points[i]), *cells, style=None if front[i] else "red")
     console.print(rows)
-    left_out(console, len(points), "points, those with the largest |q| shown")
-    behind = [p["point"] for p in points if not p["in_front"]]
+    left_out(console, one.count, "points, those with the largest |q| shown")
+    behind = [one.points[i] for i in np.flatnonzero(~front)]
     if behind:
-        names = ", ".join(map(escape, behind[:MOST_ROWS])) + (
-            ", ..." if len(behind) > MOST_ROWS else ""
-        )
-        console.print(f"[red]Behind a photo:[/red] {names}")
+        console.print(f"[red]Behind a photo:[/red] {join_names(behind, MOST_ROWS)}")
 
 
-def _legend(s: Solution, units: Units) -> str:
-    model = f", model X Y Z [{_unit(units.model)}]" if s.usable else ""
-    return f"y-parallax q and corrections v [{units.photo}], redundancy r{model}"
-
-
-def _many(
-    console: Console, solved: list[Solution], units: Units, subtitle: str
-) -> None:
-    usable = sum(s.usable for s in solved)
+def _show_many(console: Console, results: Results, subtitle: str) -> None:
+    units, usable = results.units, results.usable
     console.print(
-        f"[bold]Relative orientation of {len(solved)} pairs[/bold], {usable} usable"
+        f"[bold]Relative orientation of {len(results)} pairs[/bold], "
+        f"{usable.sum()} usable"
     )
     console.print(subtitle)
-    elements = [e for e in solved[0].elements if e.deviation is not None]
-    heads = [f"{e.name} [{_unit(e.unit)}]" if e.unit else e.name for e in elements]
+    adjusted = [e for e in One(results, 0).elements if e.deviation is not None]
+    heads = [f"{e.name} [{unit_name(e.unit)}]" if e.unit else e.name for e in adjusted]
     sigma0 = f"sigma0 [{units.sigma0}]" if units.sigma0 else "sigma0"
     rows = table("pair", "points", *heads, sigma0, f"m_q [{units.photo}]", "result")
-    for s in worst(
-        solved, lambda s: (s.usable, -s.m_q if math.isfinite(s.m_q) else 0.0)
-    ):
-        values = [number(e.value, 4) for e in s.elements if e.deviation is not None]
-        accuracy = [number(x, digits(x)) for x in (s.sigma0, s.m_q)]
-        style = None if not s.advice else "yellow" if s.usable else "red"
-        rows.add_row(
-            escape(s.measured.name),
-            str(len(s.measured.points)),
-            *values,
-            *accuracy,
-            s.result,
-            style=style,
-        )
+    m_q = np.nan_to_num(results.of_pairs["m_q"], posinf=0.0)
+    for k in worst(list(range(len(results))), lambda k: (usable[k], -m_q[k])):
+        one = One(results, k)
+        values = [number(one.value(e.name), 4) for e in adjusted]
+        accuracy = [number(x, digits(x)) for x in map(one.value, ("sigma0", "m_q"))]
+        cells = (str(one.count), *values, *accuracy, one.result)
+        style = None if not one.advice else "yellow" if one.usable else "red"
+        rows.add_row(escape(one.name), *cells, style=style)
     console.print(rows)
     left_out(
-        console, len(solved), "pairs, failed ones and those with the largest m_q shown"
+        console,
+        len(results),
+        "pairs, failed ones and those with the largest m_q shown",
     )
-    by_result: dict[str, list[Solution]] = defaultdict(list)
-    for s in solved:
-        if s.advice:
-            by_result[s.result].append(s)
+    by_result: dict[str, list[One]] = defaultdict(list)
+    for one in results:
+        if one.advice:
+            by_result[one.result].append(one)
     for result, members in by_result.items():
-        names = ", ".join(escape(s.measured.name) for s in members[:5]) + (
-            ", ..." if len(members) > 5 else ""
-        )
+        names = join_names([one.name for one in members], 5)
         colour = "yellow" if members[0].usable else "red"
         console.print(
             f"[{colour}]{result}[/{colour}] ({len(members)}: {names}): "
@@ -160,20 +143,23 @@ def _many(
         )
 
 
-def _cameras(s: Solution, units: Units) -> str:
-    left, right = (camera.focal for camera in s.cameras)
-    return (
-        f"f {left:g} {units.photo}, "
-        if left == right
-        else f"f {left:g} and {right:g} {units.photo}, "
-    )
+def join_names(names: list[str], most: int) -> str:
+    """At most so many names, for the terminal."""
+    more = ", ..." if len(names) > most else ""
+    return ", ".join(map(escape, names[:most])) + more
 
 
-def _verdict(s: Solution) -> str:
-    if not s.advice:
+def _cameras(one: One) -> str:
+    left, right = (camera.focal for camera in one.cameras)
+    unit = one.results.units.photo
+    return f"f {left:g}{'' if left == right else f' and {right:g}'} {unit}, "
+
+
+def _verdict(one: One) -> str:
+    if not one.advice:
         return "[green]successful[/green]"
-    colour = "yellow" if s.usable else "bold red"
-    return f"[{colour}]{s.result}[/{colour}]: {s.advice}"
+    colour = "yellow" if one.usable else "bold red"
+    return f"[{colour}]{one.result}[/{colour}]: {one.advice}"
 
 
 def table(first: str, *numbers: str, title: str | None = None) -> Table:
@@ -207,17 +193,21 @@ def left_out(console: Console, count: int, what: str) -> None:
         console.print(f"{MOST_ROWS} of {count} {what}; --out DIR writes all.")
 
 
-def _unit(unit: str) -> str:
+def unit_name(unit: str) -> str:
+    """A unit as the terminal shows it."""
     return {"deg": "°", "base_units": "units of the base"}.get(unit, unit)
 
 
-def digits(size: float | None, at_least: int = 4) -> int:
+def digits(size: SupportsFloat | None, at_least: int = 4) -> int:
     """Decimals that show two significant digits of `size`."""
+    size = 0.0 if size is None else float(size)
     if not size or not math.isfinite(size):
         return 4
     return max(at_least, min(8, 1 - math.floor(math.log10(abs(size)))))
 
 
-def _rms(values: Iterable[float]) -> float:
-    squares = [v * v for v in values if math.isfinite(v)]
-    return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
+def _rms(values: Any) -> float:
+    """Root mean square of the numbers that exist."""
+    numbers = np.asarray(values)
+    numbers = numbers[np.isfinite(numbers)]
+    return math.sqrt(np.mean(numbers**2)) if numbers.size else 0.0

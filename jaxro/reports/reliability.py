@@ -1,123 +1,124 @@
-"""How far the measurements of a pair check one another: for the terminal a table and
-sentences, for --out a file."""
+"""How far the measurements of a pair check one another, on the terminal: a table and
+sentences."""
 
-from typing import Any
-
+import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import gammainc, gammaincc
 from rich.console import Console
 from rich.markup import escape
 
 from ..assessment import Pattern
-from ..assessment.reliability import BOUNDS, CONTROL, Reliability
-from .pair import digits, left_out, table, worst
-from .solutions import Solution, Units, pattern_of_all
+from ..assessment.reliability import BOUNDS
+from .columns import Units
+from .model import One, Results
+from .pair import digits, left_out, table, unit_name, worst
 from .text import number
-
-COORDINATES = ("x_left", "y_left", "x_right", "y_right")
 
 DOUBTFUL = 0.05
 """Probability of sigma0 below which it is mentioned."""
 
 
-def show(console: Console, s: Solution, units: Units) -> None:
-    """The table of the points, if any can be tested, and what a surveyor should
-    mind."""
-    if s.reading is not None and np.any(s.reading.testable):
-        _points(console, s, s.reading, units)
-    for sentence in sentences(s, units):
+def show(console: Console, results: Results) -> None:
+    """Of one pair the table of the points, if any can be tested, and what a surveyor
+    should mind; of many what to mind of all together."""
+    if len(results) == 1:
+        one = One(results, 0)
+        points = _test_columns(one)
+        if points:
+            _show_points(console, one, points)
+        said = sentences(one)
+    else:
+        said = pattern_sentences(
+            results.pattern, results.units, " of all pairs together"
+        )
+    for sentence in said:
         console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
 
 
-def show_of_all(console: Console, solved: list[Solution], units: Units) -> None:
-    """What to mind of all pairs together."""
-    for sentence in pattern_sentences(
-        pattern_of_all(solved), units, " of all pairs together"
-    ):
-        console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
+def _test_columns(one: One) -> dict[str, np.ndarray]:
+    """The reliability of the points; empty where no point can be tested."""
+    if "reliability" not in one.results.of_points:
+        return {}
+    points = one.of_points("reliability")
+    return points if np.any(np.isfinite(points["w"])) else {}
 
 
-def _points(console: Console, s: Solution, reading: Reliability, units: Units) -> None:
+def _limit(points: dict[str, np.ndarray]) -> float:
+    """The limit of |w|, which is one for all points."""
+    return float(np.nanmax(points["limit"]))
+
+
+def _show_points(console: Console, one: One, points: dict[str, np.ndarray]) -> None:
     """r, |w|, the error of y_right that is just found, and what it does."""
-    w = "|w|" if reading.known else "tau"
+    results, limit = one.results, _limit(points)
+    w = "|w|" if results.sigma_known else "tau"
     title = (
-        f"r; {w}, limit {float(reading.limit):.2f}; error of y_right found from "
-        f"[{units.photo}],\n"
-        f"moving Z of its point [{_unit(units)}] and elements [sd]"
+        f"r; {w}, limit {limit:.2f}; error of y_right found from "
+        f"[{results.units.photo}],\n"
+        f"moving Z of its point [{unit_name(results.units.model)}] and elements [sd]"
     )
     rows = table("point", "r", w, "found from", "moving Z", "elements", title=title)
-    every = range(len(s.measured.points))
-    found_from, moved, suspicious = (
-        reading.detectable[3],
-        reading.external,
-        reading.suspicious,
-    )
-    for i in worst(list(every), lambda i: -abs(float(reading.w[i]))):
-        size, found, moves = (
-            abs(float(reading.w[i])),
-            float(found_from[i]),
-            float(reading.effect_height[3][i]),
-        )
-        cells = [
-            number(float(reading.redundancy[i]), 2),
-            number(size, 2),
+    sizes = np.nan_to_num(np.abs(points["w"]))
+    for i in worst(list(range(one.count)), lambda i: -sizes[i]):
+        found = points["detectable_y_right"][i]
+        moves = points["effect_on_Z_of_y_right"][i]
+        rows.add_row(
+            escape(one.points[i]),
+            number(points["redundancy"][i], 2),
+            number(sizes[i], 2),
             number(found, digits(found, 1)),
-        ]
-        cells += [number(moves, digits(moves, 1)), number(float(moved[i]), 1)]
-        style = "yellow" if suspicious[i] else None
-        rows.add_row(escape(s.measured.points[i]), *cells, style=style)
+            number(moves, digits(moves, 1)),
+            number(points["external_reliability"][i], 1),
+            style="yellow" if sizes[i] > limit else None,
+        )
     console.print(rows)
-    left_out(console, len(every), "points, those with the largest |w| shown")
+    left_out(console, one.count, "points, those with the largest |w| shown")
 
 
-def sentences(s: Solution, units: Units) -> list[str]:
+def sentences(one: One) -> list[str]:
     """What to mind of a usable orientation."""
-    if not s.usable:
+    if not one.usable:
         return []
-    freedom, reading = int(s.orientation.degrees_of_freedom), s.reading
+    freedom, points = one.value("degrees_of_freedom"), _test_columns(one)
     if freedom == 0:
         return ["Five points: no measurement checks another, and no error would show."]
     said = []
-    if reading is None and freedom == 1:
+    if not points and freedom == 1:
         said.append(
             "One degree of freedom: an error would enlarge sigma0, but no point can be "
             "tested. Measure more points, or "
             "give --sigma."
         )
-    if reading is not None:
-        said += _doubts(s, reading)
-    said += pattern_sentences(s.pattern, units)
-    redundancy = s.orientation.redundancy[: len(s.measured.points)]
-    names = [
-        [
-            p
-            for p, r in zip(s.measured.points, redundancy, strict=True)
-            if low <= r < high
-        ]
-        for low, high in zip((-np.inf, BOUNDS[0]), BOUNDS[:2], strict=True)
-    ]
-    if names[0]:
+    if points:
+        said += _doubt_sigma(one) + _doubt_points(one, points)
+    said += pattern_sentences(one.pattern, one.results.units)
+    return said + _weak_points(one, points)
+
+
+def _weak_points(one: One, points: dict[str, np.ndarray]) -> list[str]:
+    """Points that the others check poorly or not at all."""
+    redundancy = one.of_points("residuals")["redundancy"]
+    nothing = redundancy < BOUNDS[0]
+    poorly = (redundancy < BOUNDS[1]) & ~nothing
+    said = []
+    if nothing.any():
         said.append(
-            f"Nothing checks {_listed(names[0])} (redundancy below {BOUNDS[0]}): an "
-            "error there never shows."
+            f"Nothing checks {_list(one, nothing)} (redundancy below {BOUNDS[0]}): "
+            "an error there never shows."
         )
-    if names[1]:
-        every = (
-            []
-            if reading is None
-            else zip(s.measured.points, reading.detectable[3], strict=False)
-        )
-        hidden = [found for name, found in every if name in names[1]]
-        most = max((float(h) for h in hidden if np.isfinite(h)), default=None)
-        size = (
-            ""
-            if most is None
-            else (
-                f"; an error of {number(most, digits(most, 1))} {units.photo} in y may "
-                "not show"
+    if poorly.any():
+        hidden = points["detectable_y_right"][poorly] if points else np.zeros(0)
+        hidden = hidden[np.isfinite(hidden)]
+        size = ""
+        if hidden.size:
+            most = float(hidden.max())
+            size = (
+                f"; an error of {number(most, digits(most, 1))} "
+                f"{one.results.units.photo} in y may not show"
             )
-        )
         said.append(
-            f"Poorly checked (redundancy below {BOUNDS[1]}): {_listed(names[1])}{size}."
+            f"Poorly checked (redundancy below {BOUNDS[1]}): "
+            f"{_list(one, poorly)}{size}."
         )
     return said
 
@@ -137,86 +138,45 @@ def pattern_sentences(pattern: Pattern | None, units: Units, of: str = "") -> li
     ]
 
 
-def _doubts(s: Solution, reading: Reliability) -> list[str]:
-    """What the tests of sigma0 and of the points found."""
-    said = []
-    if reading.known:
-        ratio, chance = (
-            float(reading.estimated / reading.sigma0),
-            float(reading.global_p()),
-        )
-        if chance < DOUBTFUL and ratio > 1:
-            said.append(
-                f"The coordinates are {ratio:.1f} times less accurate than their sigma "
-                "says (probability "
-                f"{chance:.1g}): sigma is too small, or points are wrong."
-            )
-        elif chance < DOUBTFUL:
-            said.append(
-                f"The coordinates are {1 / ratio:.1f} times more accurate than their "
-                "sigma says (probability "
-                f"{chance:.1g}): sigma is too large."
-            )
-    w = np.where(reading.testable, np.abs(reading.w), 0.0)
-    if w.size and np.max(w) > reading.limit:
-        others = int(np.sum(w > reading.limit)) - 1
-        also = (
-            f"; so has {others} other point{'s' * (others != 1)}, perhaps because of it"
-            if others
-            else ""
-        )
-        said.append(
-            f"Point {s.measured.points[int(np.argmax(w))]} has "
-            f"|{'w' if reading.known else 'tau'}| = {np.max(w):.2f} "
-            f"where {float(reading.limit):.2f} "
-            f"is allowed{also}. Measure it again, or see jaxro clean."
-        )
-    return said
+def _doubt_sigma(one: One) -> list[str]:
+    """What the test of sigma0 against the given sigma found."""
+    ratio, freedom = one.value("sigma0"), one.value("degrees_of_freedom")
+    if not one.results.sigma_known:
+        return []
+    half = jnp.asarray(freedom * ratio**2 / 2)
+    below, above = (tail(freedom / 2, half) for tail in (gammainc, gammaincc))
+    chance = float(2 * jnp.minimum(below, above))
+    if chance >= DOUBTFUL:
+        return []
+    if ratio > 1:
+        return [
+            f"The coordinates are {ratio:.1f} times less accurate than their sigma "
+            f"says (probability {chance:.1g}): sigma is too small, or points are wrong."
+        ]
+    return [
+        f"The coordinates are {1 / ratio:.1f} times more accurate than their sigma "
+        f"says (probability {chance:.1g}): sigma is too large."
+    ]
 
 
-def _listed(names: list[str]) -> str:
+def _doubt_points(one: One, points: dict[str, np.ndarray]) -> list[str]:
+    """What the tests of the points found."""
+    w, limit = np.nan_to_num(np.abs(points["w"])), _limit(points)
+    if not np.max(w) > limit:
+        return []
+    others = int(np.sum(w > limit)) - 1
+    also = ""
+    if others:
+        plural = "s" * (others != 1)
+        also = f"; so has {others} other point{plural}, perhaps because of it"
+    return [
+        f"Point {one.points[int(np.argmax(w))]} has "
+        f"|{'w' if one.results.sigma_known else 'tau'}| = {np.max(w):.2f} "
+        f"where {limit:.2f} is allowed{also}. Measure it again, or see jaxro clean."
+    ]
+
+
+def _list(one: One, those: np.ndarray) -> str:
+    names = [one.points[i] for i in np.flatnonzero(those)]
     some = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
     return f"point{'s' * (len(names) > 1)} {some}"
-
-
-def _unit(units: Units) -> str:
-    return {"base_units": "units of the base"}.get(units.model, units.model)
-
-
-def file_rows(solved: list[Solution], units: Units) -> list[list[Any]]:
-    """reliability.csv: every point of every pair; empty where nothing checks it."""
-    photo, model = f"_{units.photo}", f"_{units.model}"
-    heads = ["pair", "point", "redundancy", "w", "limit", "external_reliability"]
-    heads += [f"control_{c}" for c in COORDINATES] + [
-        f"detectable_{c}{photo}" for c in COORDINATES
-    ]
-    rows: list[list[Any]] = [
-        heads + [f"effect_on_Z_of_{c}{model}" for c in COORDINATES]
-    ]
-    for s in solved:
-        if s.reading is None or not s.usable:
-            rows += [
-                [s.measured.name, name] + [None] * (len(rows[0]) - 2)
-                for name in s.measured.points
-            ]
-            continue
-        reading = s.reading
-        control = [
-            np.searchsorted(BOUNDS, r, side="right")
-            for r in reading.coordinate_redundancy
-        ]
-        tested, external, sizes = (
-            reading.testable,
-            reading.external,
-            (*reading.detectable, *reading.effect_height),
-        )
-        for i, name in enumerate(s.measured.points):
-            row = [s.measured.name, name, float(reading.redundancy[i])]
-            row += (
-                [float(reading.w[i]), float(reading.limit)]
-                if tested[i]
-                else [None, None]
-            )
-            row += [float(external[i]), *(CONTROL[c[i]] for c in control)]
-            rows.append([*row, *(float(size[i]) for size in sizes)])
-    return rows

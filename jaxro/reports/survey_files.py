@@ -2,7 +2,7 @@
 files."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -85,7 +85,7 @@ class Done:
         )
 
 
-def finished(named: Named) -> Done:
+def calculate(named: Named) -> Done:
     """The survey calculated. Raises TableError where the network of its traverses has
     no solution."""
     found = jax.tree.map(np.asarray, grid_survey.solve(named.survey))
@@ -112,11 +112,11 @@ def finished(named: Named) -> Done:
         else:
             origin.append("grid")
     return Done(
-        named,
-        found,
-        _traverses(named, one, found),
-        _closures(named, one, found),
-        origin,
+        named=named,
+        found=found,
+        traverses=_traverses(named, one, found),
+        closures=_closures(named, one, found),
+        origin=origin,
     )
 
 
@@ -131,15 +131,15 @@ def _traverses(named: Named, one, found: grid_survey.Surveyed) -> list[Traverse]
         legs = network.leg[network.traverse == k]
         result.append(
             Traverse(
-                ", ".join(dict.fromkeys(named.traverses[leg] for leg in legs)),
-                point(network.first[k]),
-                point(network.last[k]),
-                len(legs),
-                float(found.heights.misclosure[k]),
-                float(found.deviations.misclosure[k]),
-                float(found.w[k]),
-                float(found.detectable[k]),
-                float(adjusted.redundancy[k]),
+                names=", ".join(dict.fromkeys(named.traverses[leg] for leg in legs)),
+                first=point(network.first[k]),
+                last=point(network.last[k]),
+                legs=len(legs),
+                misclosure=float(found.heights.misclosure[k]),
+                deviation=float(found.deviations.misclosure[k]),
+                w=float(found.w[k]),
+                detectable=float(found.detectable[k]),
+                redundancy=float(adjusted.redundancy[k]),
             )
         )
     return result
@@ -164,88 +164,51 @@ def _closures(named: Named, one, found: grid_survey.Surveyed) -> list[Closure]:
     return result
 
 
+TRAVERSES = (
+    *("traverse", "from", "to", "legs", "misclosure_mm", "sd_mm", "w"),
+    *("detectable_mm", "redundancy"),
+)
+"""The header of traverses.csv: the fields of a `Traverse`."""
+
+
 def contents(done: Done) -> dict[str, Any]:
     """The files of --out by name."""
+    texts = {"heights.csv": _text(_heights(done))}
+    adjusted = done.found.adjusted
+    if done.traverses and adjusted is not None:
+        rows = [TRAVERSES, *map(astuple, done.traverses)]
+        texts["traverses.csv"] = files.csv_text(rows)
+        names, survey = np.array(done.named.names, object), done.named.survey
+        legs = {
+            "traverse": done.named.traverses,
+            "from": names[np.asarray(survey.start)],
+            "to": names[np.asarray(survey.end)],
+            "v_mm": adjusted.corrections.tolist(),
+            "redundancy": adjusted.leg_redundancy.tolist(),
+        }
+        texts["legs.csv"] = _text(legs)
+    return texts | {"summary.json": files.json_text(summary(done))}
+
+
+def _heights(done: Done) -> dict[str, Any]:
+    """The columns of heights.csv."""
     named, found = done.named, done.found
-    header = [
-        "point",
-        "square",
-        "height_mm",
-        "sd_mm",
-        "from",
-        "over_grid_mm",
-        "sd_over_grid_mm",
-    ]
-    header += [f"share_{name}" for name in grid_survey.Measured._fields]
-    lines: list[list[Any]] = [header]
-    square = np.asarray(named.survey.square)
-    for i in range(named.points):
-        numbers = [
-            float(a[i])
-            for a in (
-                found.heights.over_grid,
-                found.deviations.over_grid,
-                *found.shares,
-            )
-        ]
-        value, deviation = (
-            float(found.heights.value[i]),
-            float(found.deviations.value[i]),
-        )
-        lines.append(
-            [
-                named.names[i],
-                named.squares[square[i]],
-                value,
-                deviation,
-                done.origin[i],
-                *numbers,
-            ]
-        )
-    texts: dict[str, Any] = {"heights.csv": files.csv_text(lines)}
-    if done.traverses and found.adjusted is not None:
-        head = [
-            "traverse",
-            "from",
-            "to",
-            "legs",
-            "misclosure_mm",
-            "sd_mm",
-            "w",
-            "detectable_mm",
-            "redundancy",
-        ]
-        body = [
-            [
-                t.names,
-                t.first,
-                t.last,
-                t.legs,
-                t.misclosure,
-                t.deviation,
-                t.w,
-                t.detectable,
-                t.redundancy,
-            ]
-            for t in done.traverses
-        ]
-        texts["traverses.csv"] = files.csv_text([head, *body])
-        ends = [
-            [named.names[i] for i in np.asarray(a)]
-            for a in (named.survey.start, named.survey.end)
-        ]
-        legs = zip(
-            named.traverses,
-            *ends,
-            found.adjusted.corrections.tolist(),
-            found.adjusted.leg_redundancy.tolist(),
-            strict=True,
-        )
-        texts["legs.csv"] = files.csv_text(
-            [["traverse", "from", "to", "v_mm", "redundancy"], *map(list, legs)]
-        )
-    texts["summary.json"] = files.json_text(summary(done))
-    return texts
+    own = lambda values: np.asarray(values)[: named.points].tolist()
+    return {
+        "point": named.names[: named.points],
+        "square": [named.squares[k] for k in own(named.survey.square)],
+        "height_mm": own(found.heights.value),
+        "sd_mm": own(found.deviations.value),
+        "from": done.origin,
+        "over_grid_mm": own(found.heights.over_grid),
+        "sd_over_grid_mm": own(found.deviations.over_grid),
+        **{f"share_{name}": own(a) for name, a in found.shares._asdict().items()},
+    }
+
+
+def _text(columns: dict[str, Any]) -> str:
+    """Columns as CSV text."""
+    return files.csv_text([list(columns), *zip(*columns.values(), strict=True)])
 
 
 def summary(done: Done) -> dict[str, Any]:

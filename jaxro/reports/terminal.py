@@ -19,7 +19,7 @@ def consoles() -> tuple[Console, Console]:
     )
 
 
-def aborted() -> NoReturn:
+def abort() -> NoReturn:
     """The end of a process after Ctrl-C, while the exception still holds what its calls
     hold.
 

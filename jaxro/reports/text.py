@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, SupportsFloat
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -23,8 +23,9 @@ def table(*heads: str, left: int = 1) -> Table:
     return empty
 
 
-def number(value: float | int, digits: int) -> str:
+def number(value: SupportsFloat, digits: int) -> str:
     """The value with so many decimals, "-" if it does not exist; never minus zero."""
+    value = float(value)
     if not math.isfinite(value):
         return "-"
     text = f"{value:.{digits}f}"

@@ -14,28 +14,20 @@ decisions.csv, decisions.json.
 What a statistic is, and its unit, says the procedure; inf: wrong by any measure.
 """
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry.elements import IndependentElements
-from ..rejection import OUTCOMES, Log, Rejection
-from ..tables.csv import COLUMNS, Measurements
-from .files import csv_text, head, json_text
-
-NAMES = {int(item._value): name for name, item in OUTCOMES._name_to_item.items()}
-"""Names of the outcomes by their number."""
-
-ADVICE = {name: OUTCOMES[item] for name, item in OUTCOMES._name_to_item.items()}
-"""The sentence of each outcome, empty where the procedure finished."""
-
+from ..rejection import Rejection
+from ..tables.measured import Table, take
+from .columns import CLEANED, OUTCOME_ADVICE, OUTCOME_NAMES, ROUNDS, Column, Units
+from .files import json_text, table_text
 
 Either = Array | np.ndarray
 
@@ -78,220 +70,148 @@ def unusable(kept: Either, order: Either) -> Either:
     return ~kept & (order == 0)
 
 
-def without_log(found: Rejection) -> tuple[Decision, None]:
-    """The decision alone."""
-    return decision(found), None
+def without_log(found: Rejection) -> tuple[Any, dict[str, Any]]:
+    """The outcome of a pair; the decision about every point."""
+    of_points = decision(found)._asdict()
+    return {"outcome": of_points.pop("outcome")}, of_points
 
 
-def with_log(found: Rejection) -> tuple[Decision, Log]:
-    """The decision and all that led to it."""
-    return decision(found), found.log
+def with_log(found: Rejection) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The same, and the rounds that led to it: numbers of points have the round on
+    their second axis."""
+    of_pair, of_points = without_log(found)
+    log = found.log
+    of_rounds = {"happened": log.happened, "limit": log.limit, "elements": log.elements}
+    by_point = {
+        "statistic": log.statistic.T,
+        "rejected": log.rejected.T,
+        "parallax": log.parallax.T,
+    }
+    return of_pair | {"rounds": of_rounds}, of_points | {"rounds": by_point}
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """One pair with the decision about its points, NumPy values without padding.
+class Rounds(NamedTuple):
+    """Every point in use in every round: the `rows` of the points, the other `columns`
+    by name; `elements` (round, 5) of every pair."""
 
-    `parallax`: of every point at the orientation of those kept, NaN where that is not
-    usable. `log`: the rounds that took place, if asked for.
-    """
-
-    measured: Measurements
-    decision: Decision
-    parallax: np.ndarray
-    log: Log | None = None
-
-    @cached_property
-    def outcome(self) -> str:
-        """The name of the outcome."""
-        return NAMES[int(self.decision.outcome)]
-
-    @cached_property
-    def finished(self) -> bool:
-        """Whether the procedure came to its ordinary end."""
-        return self.outcome == "finished"
-
-    @cached_property
-    def rejected(self) -> list[int]:
-        """The points rejected, first ones first."""
-        order = np.asarray(self.decision.order)
-        out = np.flatnonzero(~np.asarray(self.decision.kept))
-        return out[np.argsort(order[out], kind="stable")].tolist()
-
-    @cached_property
-    def undecided(self) -> list[str]:
-        """The names of the points of which one is wrong, none of them rejected."""
-        return [
-            self.measured.points[i] for i in np.flatnonzero(self.decision.undecided)
-        ]
-
-    def rounds(self) -> Iterator[tuple]:
-        """(statistic, limit, rejected, parallax, elements) of every round, if they were
-        asked for."""
-        if self.log is not None:
-            g = self.log
-            yield from zip(
-                g.statistic,
-                map(float, g.limit),
-                g.rejected,
-                g.parallax,
-                g.elements,
-                strict=True,
-            )
-
-    def without_parallax(self) -> "Verdict":
-        """The same where the points kept have no usable orientation."""
-        return replace(self, parallax=np.full_like(self.parallax, np.nan))
-
-    @cached_property
-    def kept(self) -> Measurements:
-        """The measurements of the points kept."""
-        use = np.flatnonzero(self.decision.kept)
-        m = self.measured
-        return Measurements(
-            m.name,
-            [m.points[i] for i in use],
-            [m.rows[i] for i in use],
-            [m.lines[i] for i in use],
-        )
+    rows: Int[np.ndarray, " entry"]
+    columns: dict[str, np.ndarray]
+    elements: list[Float[np.ndarray, "round 5"]]
 
 
-def verdict(
-    measured: Measurements, found: Decision, parallax: np.ndarray, log: Log | None
-) -> Verdict:
-    """The verdict on one pair from padded arrays; copies, so that those of a whole
-    batch can go."""
-    n = len(measured.points)
-    own = Decision(*(np.array(a[:n] if np.ndim(a) else a) for a in found))
-    rounds = None if log is None else np.flatnonzero(log.happened)
-    return Verdict(
-        measured,
-        own,
-        np.array(parallax[:n]),
-        log and jax.tree.map(lambda a: a[rounds], log),
+def read_rounds(of_pair: dict[str, Any], of_points: dict[str, Any]) -> Rounds:
+    """The rounds of one pair that took place, from what `with_log` tells of it; rows
+    are counted in the pair."""
+    happened = np.flatnonzero(of_pair["happened"])
+    log = {name: values[:, happened].T for name, values in of_points.items()}
+    rejected_before = np.cumsum(log["rejected"], axis=0) > log["rejected"]
+    number, point = np.nonzero(~rejected_before)
+    columns = {name: values[number, point] for name, values in log.items()}
+    columns |= {"round": number + 1, "limit": of_pair["limit"][happened][number]}
+    return Rounds(point, columns, [of_pair["elements"][happened]])
+
+
+def join_rounds(each: Sequence[Rounds], begins: Int[np.ndarray, " pair"]) -> Rounds:
+    """The rounds of all pairs, whose points begin with these rows."""
+    rows = [one.rows + begin for one, begin in zip(each, begins, strict=True)]
+    columns = {
+        name: np.concatenate([one.columns[name] for one in each])
+        for name in each[0].columns
+    }
+    return Rounds(
+        np.concatenate(rows), columns, [e for one in each for e in one.elements]
     )
 
 
-def texts(
-    verdicts: list[Verdict], unit: str, summary: dict[str, Any]
-) -> dict[str, str]:
+@dataclass(frozen=True)
+class Verdicts:
+    """Pairs with the decision about their points, all of which `table` holds.
+
+    `outcome`: numbers of `OUTCOMES`. `of_points`: the columns of a `Decision`, and q,
+    the y-parallax at the orientation of the points kept. `rounds`: if asked for.
+    """
+
+    table: Table
+    outcome: Int[np.ndarray, " pair"]
+    of_points: dict[str, np.ndarray]
+    rounds: Rounds | None = None
+
+    @cached_property
+    def outcomes(self) -> list[str]:
+        """The names of the outcomes."""
+        return [OUTCOME_NAMES[number] for number in self.outcome.tolist()]
+
+    @cached_property
+    def rejected(self) -> Int[np.ndarray, " some"]:
+        """The rows that were rejected: pair by pair, first ones first."""
+        out = np.flatnonzero(~self.of_points["kept"])
+        order = self.of_points["order"][out]
+        return out[np.lexsort((order, self.table.owners[out]))]
+
+    @cached_property
+    def undecided(self) -> dict[int, list[str]]:
+        """By the number of the pair the points of which one is wrong, none rejected."""
+        named: dict[int, list[str]] = {}
+        for row in np.flatnonzero(self.of_points["undecided"]):
+            named.setdefault(int(self.table.owners[row]), []).append(
+                str(self.table.points[row])
+            )
+        return named
+
+    def written(self) -> tuple[Sequence[Column], dict[str, Any]]:
+        """The columns of the table of every row with its verdict, and their values."""
+        table, found = self.table, self.of_points
+        kept = found["kept"]
+        order = np.where(kept, -1, found["order"]).astype(np.int32)
+        values = {
+            "pair": take(table.names, table.owners),
+            "point": table.points,
+            "verdict": np.where(kept & found["undecided"], 2, kept.astype(int)),
+        }
+        return CLEANED, table.numbers | found | values | {"order": order}
+
+
+def texts(verdicts: Verdicts, units: Units, summary: dict[str, Any]) -> dict[str, str]:
     """The content of the three files by name."""
+    columns, values = verdicts.written()
+    assert verdicts.table.lines is not None and verdicts.rounds is not None
+    by_line = np.argsort(verdicts.table.lines)
+    ordered = {name: take(column, by_line) for name, column in values.items()}
+    table, rounds = verdicts.table, verdicts.rounds
+    named = {
+        "pair": table.names[table.owners[rounds.rows]],
+        "point": table.points[rounds.rows],
+    }
+    pairs = [_summary(verdicts, number) for number in range(len(table.names))]
     return {
-        "cleaned.csv": csv_text(_point_rows(verdicts, unit)),
-        "decisions.csv": csv_text(_round_rows(verdicts, unit)),
-        "decisions.json": json_text(
-            {**summary, "pairs": [_summary(v) for v in verdicts]}
-        ),
+        "cleaned.csv": table_text(columns, ordered, units),
+        "decisions.csv": table_text(ROUNDS, rounds.columns | named, units),
+        "decisions.json": json_text({**summary, "pairs": pairs}),
     }
 
 
-def _point_rows(verdicts: list[Verdict], unit: str) -> list[list[Any]]:
-    sigma = [] if verdicts[0].measured.sigma is None else ["sigma"]
-    header = [
-        "pair",
-        *COLUMNS.required,
-        *sigma,
-        "verdict",
-        "order",
-        "statistic",
-        "limit",
-        head("q", unit),
-    ]
-    rows: list[tuple[int, list[Any]]] = []
-    for v in verdicts:
-        m, d = v.measured, v.decision
-        columns = (
-            m.lines,
-            m.points,
-            m.rows,
-            d.kept,
-            d.undecided,
-            d.order,
-            d.statistic,
-            d.limit,
-            v.parallax,
-        )
-        for line, name, row, kept, undecided, order, statistic, limit, q in zip(
-            *map(list, columns), strict=True
-        ):
-            verdict = (
-                ["undecided" if undecided else "kept", ""]
-                if kept
-                else ["rejected", int(order)]
-            )
-            rows.append(
-                (
-                    line,
-                    [
-                        m.name,
-                        name,
-                        *row,
-                        *verdict,
-                        _value(statistic),
-                        float(limit),
-                        float(q),
-                    ],
-                )
-            )
-    return [header, *(row for _, row in sorted(rows, key=lambda entry: entry[0]))]
-
-
-def _round_rows(verdicts: list[Verdict], unit: str) -> list[list[Any]]:
-    rows: list[list[Any]] = [
-        [
-            "pair",
-            "round",
-            "point",
-            "statistic",
-            "limit",
-            "rejected",
-            head("parallax", unit),
-        ]
-    ]
-    for v in verdicts:
-        use = np.ones(len(v.measured.points), bool)
-        for number, (statistic, limit, rejected, parallax, _) in enumerate(
-            v.rounds(), 1
-        ):
-            for i in np.flatnonzero(use):
-                point = v.measured.points[i]
-                rows.append(
-                    [
-                        v.measured.name,
-                        number,
-                        point,
-                        _value(statistic[i]),
-                        limit,
-                        bool(rejected[i]),
-                        float(parallax[i]),
-                    ]
-                )
-            use &= ~rejected[: len(use)]
-    return rows
-
-
-def _summary(v: Verdict) -> dict[str, Any]:
+def _summary(verdicts: Verdicts, number: int) -> dict[str, Any]:
+    """What decisions.json says of a pair."""
+    table = verdicts.table
+    assert verdicts.rounds is not None
+    first, last = np.searchsorted(table.owners[verdicts.rejected], [number, number + 1])
+    rejected = verdicts.rejected[first:last]
     together: dict[int, list[str]] = {}
-    for i in v.rejected:
-        together.setdefault(int(v.decision.order[i]), []).append(v.measured.points[i])
+    for row in rejected:
+        order = int(verdicts.of_points["order"][row])
+        together.setdefault(order, []).append(table.points[row])
     names = [f"{name}_deg" for name in IndependentElements.names]
+    outcome = verdicts.outcomes[number]
     return {
-        "pair": v.measured.name,
-        "outcome": v.outcome,
-        "advice": ADVICE[v.outcome],
-        "points": len(v.measured.points),
-        "rejected": len(v.rejected),
+        "pair": table.names[number],
+        "outcome": outcome,
+        "advice": OUTCOME_ADVICE[outcome],
+        "points": int(table.lengths[number]),
+        "rejected": len(rejected),
         "order": list(together.values()),
-        "undecided": v.undecided,
+        "undecided": verdicts.undecided.get(number, []),
         "elements": [
-            {
-                "round": number,
-                **dict(zip(names, np.rad2deg(elements).tolist(), strict=True)),
-            }
-            for number, (*_, elements) in enumerate(v.rounds(), 1)
+            {"round": k, **dict(zip(names, np.rad2deg(values).tolist(), strict=True))}
+            for k, values in enumerate(verdicts.rounds.elements[number], 1)
         ],
     }
-
-
-def _value(statistic: float) -> float | str:
-    return "inf" if math.isinf(statistic) else float(statistic)

@@ -11,16 +11,14 @@ pixel_size = 1, y_down = false.
 import re
 import sys
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jax
-import numpy as np
-
 from ..geometry.pairs import Camera, Pair
-from .csv import Measurements
 from .fields import TableError, read_text
+from .measured import CameraPairs, Measurements, of_pairs, one_pair, to_list, to_ragged
 
 KEYS = ("focal", "principal_point", "pixel_size", "y_down")
 FORMS = "[camera], or [left] and [right], or [photo.NAME] for every photo"
@@ -64,13 +62,38 @@ class Cameras:
         return self.photos[known[0][0]], self.photos[known[0][1]]
 
     def of_all(
-        self, names: Any, file: str
-    ) -> tuple[Camera, Camera] | list[tuple[Camera, Camera]]:
-        """(left, right) that all pairs have, or those of each of the names, an Arrow
-        array. Raises TableError."""
+        self,
+        names: Any,
+        file: str,
+        *,
+        one_sigma: bool = False,
+        place: Callable[[int], int | str | None] = lambda number: None,
+    ) -> CameraPairs:
+        """(left, right) that all pairs have, or those of each of the names, a column.
+
+        `one_sigma`: one standard deviation has to serve both photos. `place`: where the
+        pair of a number begins in the file. Raises TableError.
+        """
         if self.left is not None and self.right is not None:
+            if one_sigma:
+                check_one_sigma(file, place(0), self.left, self.right)
             return self.left, self.right
-        return [self.of(str(name), file) for name in names.to_pylist()]
+        each = []
+        for number, name in enumerate(map(str, to_list(names))):
+            try:
+                both = self.of(name, file)
+                if one_sigma:
+                    check_one_sigma(file, None, *both)
+            except TableError as error:
+                raise TableError(
+                    error.file,
+                    line=place(number),
+                    column=error.column,
+                    found=error.found,
+                    expected=error.expected,
+                ) from None
+            each.append(both)
+        return each
 
 
 def read(path: Path) -> Cameras:
@@ -208,33 +231,8 @@ def to_pair(
     """Measured coordinates as a `Pair` in photo coordinates; sigma for all points or
     from the table.
 
-    The arithmetic is that of `Camera.to_photo`, in NumPy: tables have pairs of every
-    length, and JAX would compile it for each. Raises TableError where one sigma cannot
-    serve two pixel sizes.
+    Raises TableError where one sigma cannot serve two pixel sizes.
     """
-    coordinates = []
-    for camera, (u, v) in (
-        (left, measured.coordinates[:2]),
-        (right, measured.coordinates[2:]),
-    ):
-        u0, v0 = camera.principal_point
-        sign = -1.0 if camera.y_down else 1.0
-        coordinates += [
-            (u - u0) * camera.pixel_size,
-            sign * (v - v0) * camera.pixel_size,
-        ]
-    count = len(measured.points)
-    deviation = np.ones(count)
     if measured.sigma is not None or sigma is not None:
-        deviation = (
-            np.full(count, sigma) if measured.sigma is None else measured.sigma
-        ) * left.pixel_size
         check_one_sigma(file, measured.lines[0], left, right)
-    fields = (
-        *coordinates,
-        deviation,
-        np.ones(count, bool),
-        np.float64(left.focal),
-        np.float64(right.focal),
-    )
-    return Pair(*jax.device_put(fields))
+    return one_pair(to_ragged(of_pairs([measured], file), (left, right), sigma), 0)

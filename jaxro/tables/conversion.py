@@ -3,7 +3,6 @@ does, else line by line."""
 
 import csv
 import mmap
-import os
 import re
 from contextlib import suppress
 from itertools import islice
@@ -13,26 +12,22 @@ from typing import Any
 import numpy as np
 import pyarrow.csv as arrow_csv
 
-from . import csv as tables
-from .csv import COLUMNS
+from . import csv as tables, whole
+from .measured import COLUMNS, NUMBERS
 from .parquet import BATCH, NAMES, encoding, pa, pc, pq
 
 
-def converted(source: Path, target: Path) -> None:
+def convert(source: Path, target: Path) -> None:
     """A CSV table as a Parquet table, in bounded memory. Raises TableError with line
     and column."""
-    draft = target.with_suffix(".partial")
-    try:
+    with whole.draft_of(target) as draft:
         try:
-            _quickly(source, draft)
+            _convert_quickly(source, draft)
         except (pa.ArrowInvalid, pa.ArrowKeyError):
-            _carefully(source, draft)  # or says what is wrong where
-        os.replace(draft, target)
-    finally:
-        draft.unlink(missing_ok=True)
+            _convert_carefully(source, draft)  # or says what is wrong where
 
 
-def _quickly(source: Path, draft: Path) -> None:
+def _convert_quickly(source: Path, draft: Path) -> None:
     """By Arrow, which is to find what `tables` would. Raises ArrowInvalid where it
     might not."""
     line, header = 1, []
@@ -70,7 +65,7 @@ def _quickly(source: Path, draft: Path) -> None:
         raise pa.ArrowInvalid("no rows")
 
 
-def _carefully(source: Path, draft: Path) -> None:
+def _convert_carefully(source: Path, draft: Path) -> None:
     """Line by line, a tenth as fast. Raises TableError."""
     lines, writer = tables.lines(source), None
     while rows := list(islice(lines, BATCH)):
@@ -79,7 +74,7 @@ def _carefully(source: Path, draft: Path) -> None:
         batch = pa.table(
             columns
             | {"point": points}
-            | dict(zip(tables.NUMBERS, zip(*values, strict=True), strict=False))
+            | dict(zip(NUMBERS, zip(*values, strict=True), strict=False))
         )
         writer = writer or pq.ParquetWriter(
             draft, batch.schema, **encoding(batch.schema)

@@ -1,5 +1,5 @@
-"""Tables of measured image coordinates: CSV text in, one `Measurements` per pair out,
-or one clear error.
+"""Tables of measured image coordinates: CSV text in, a `Table` of columns out, or one
+clear error.
 
 Columns, in any order: point, x_left, y_left, x_right, y_right and optionally pair,
 sigma; `id,xl,yl,xr,yr` is the short form of the first five. Coordinates and sigma are
@@ -9,58 +9,11 @@ skipped or guessed: whatever does not fit stops the reading with file, line and 
 
 import io
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float
-
 from . import fields
-from .fields import Columns, TableError, read_text
-
-COLUMNS = Columns(
-    ("point", "x_left", "y_left", "x_right", "y_right"),
-    ("pair", "sigma"),
-    {"id": "point", "xl": "x_left", "yl": "y_left", "xr": "x_right", "yr": "y_right"},
-)
-NUMBERS = (*COLUMNS.required[1:], "sigma")
-
-
-@dataclass
-class Measurements:
-    """The measured points of one pair; `lines` are their lines in the file."""
-
-    name: str
-    points: list[str] = field(default_factory=list)
-    rows: list[tuple[float, ...]] = field(default_factory=list)
-    lines: list[int] = field(default_factory=list)
-
-    @property
-    def coordinates(self) -> Float[np.ndarray, "4 point"]:
-        """x_left, y_left, x_right, y_right"""
-        return np.asarray(self.rows, np.float64)[:, :4].T
-
-    @property
-    def sigma(self) -> Float[np.ndarray, " point"] | None:
-        """Standard deviations of the coordinates, where the table has them."""
-        return (
-            np.asarray(self.rows, np.float64)[:, 4] if len(self.rows[0]) == 5 else None
-        )
-
-
-@dataclass
-class Table:
-    """All pairs of one file in the order of their first points, and what a careful
-    reader should be told."""
-
-    file: str
-    pairs: list[Measurements]
-    warnings: list[str]
-
-    @property
-    def has_sigma(self) -> bool:
-        """True where the table has a column sigma."""
-        return self.pairs[0].sigma is not None
+from .fields import TableError, read_text
+from .measured import COLUMNS, NUMBERS, Measurements, Table, of_pairs
 
 
 def read(path: Path) -> Table:
@@ -77,7 +30,9 @@ def parse(text: str, file: str, name: str) -> Table:
     seen: dict[str, dict[str, int]] = {}
     places: dict[tuple, str] = {}
     twins: dict[str, list[str]] = {}
-    for line, pair, point, values in checked(io.StringIO(text, newline=""), file, name):
+    for line, pair, point, values in check_lines(
+        io.StringIO(text, newline=""), file, name
+    ):
         first = seen.setdefault(pair, {}).setdefault(point, line)
         if first != line:
             found = f"{point!r} a second time in pair {pair!r} (first on line {first})"
@@ -97,11 +52,8 @@ def parse(text: str, file: str, name: str) -> Table:
         measured.lines.append(line)
     if not pairs:
         raise no_points(file, line)
-    return Table(
-        file,
-        list(pairs.values()),
-        [_twins(file, pair, found) for pair, found in twins.items()],
-    )
+    warnings = [_twins(file, pair, found) for pair, found in twins.items()]
+    return of_pairs(list(pairs.values()), file, warnings)
 
 
 def no_points(file: str, line: int) -> TableError:
@@ -115,15 +67,15 @@ def no_points(file: str, line: int) -> TableError:
 
 
 def lines(path: Path) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
-    """The `checked` lines of a file, one at a time. Raises TableError."""
+    """The `check_lines` lines of a file, one at a time. Raises TableError."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            yield from checked(file, str(path))
+            yield from check_lines(file, str(path))
     except (OSError, UnicodeDecodeError):
         read_text(path)  # says which
 
 
-def checked(
+def check_lines(
     text: Iterable[str], file: str, name: str = ""
 ) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
     """(line number, pair, point, numbers) of every line below the header, each field

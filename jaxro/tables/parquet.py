@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
-from ..batches.ragged import Ragged
-from ..geometry.pairs import Camera
 from . import csv as tables
-from .csv import COLUMNS
 from .fields import TableError
+from .measured import COLUMNS, NUMBERS, Table
 
 try:
     import pyarrow as pa
@@ -112,7 +110,7 @@ class Source:
             known.row_group(k).column(place).statistics
             for k in range(known.num_row_groups)
         ]
-        if all(map(_named, groups)):
+        if all(map(_has_names, groups)):
             return
         row = 0
         for batch in self._file.iter_batches(BATCH, columns=[self.columns[full]]):
@@ -153,7 +151,23 @@ class Source:
         line, *_ = next(islice(tables.lines(self.path), row, None))
         return f"line {line}"
 
-    def rows(self, begin: int, end: int) -> Any:
+    def read(self, begins: np.ndarray) -> Table:
+        """The pairs that begin with these rows, and end before the last of them."""
+        rows = self._rows(int(begins[0]), int(begins[-1]))
+        own = begins - begins[0]
+        if "pair" in rows.column_names:
+            names = rows.column("pair").take(pa.array(own[:-1])).combine_chunks()
+        else:
+            names = pa.array([self.path.stem] * (len(own) - 1))
+        return Table(
+            file=str(self.path),
+            names=names,
+            begins=own,
+            points=rows.column("point"),
+            numbers={n: rows.column(n) for n in NUMBERS if n in rows.column_names},
+        )
+
+    def _rows(self, begin: int, end: int) -> Any:
         """These rows as an Arrow table with the full names of the columns; one behind
         the other is read only once."""
         if begin != self._position:
@@ -186,7 +200,7 @@ class Source:
             skip -= min(skip, len(piece))
 
 
-def _named(told: Any) -> bool:
+def _has_names(told: Any) -> bool:
     """Whether the statistics of a column say that no value is missing and no text
     begins with a blank."""
     if (
@@ -240,82 +254,18 @@ def _runs(column: Any, last: Any) -> np.ndarray:
     )
 
 
-def names(table: Any, starts: np.ndarray, file: str) -> Any:
-    """The name of each pair of a part, as an Arrow array; of a table without a column
-    `pair` that of the file."""
-    if "pair" not in table.column_names:
-        return pa.array([Path(file).stem] * len(starts))
-    return table.column("pair").take(pa.array(starts)).combine_chunks()
-
-
-def owners(begins: np.ndarray) -> Any:
-    """Of every row of a part the number of its pair."""
-    return pa.array(np.repeat(np.arange(len(begins) - 1), np.diff(begins)))
-
-
-def twice(table: Any, begins: np.ndarray) -> np.ndarray:
-    """The pairs of a part that have two points of one name."""
-    codes = table.column("point").combine_chunks()
+def repeat_points(table: Table) -> np.ndarray:
+    """The numbers of the pairs that have two points of one name."""
+    begins = table.begins
+    codes = table.points.combine_chunks()
     codes = codes if pa.types.is_dictionary(codes.type) else codes.dictionary_encode()
     codes = codes.indices.to_numpy(zero_copy_only=False).astype(np.int64)
     rising = np.diff(codes) > 0
     rising[begins[1:-1] - 1] = True
     if np.all(rising):  # the names come in one order in every pair: none can come twice
         return np.zeros(0, int)
-    key = np.sort(owners(begins).to_numpy() * (int(codes.max()) + 1) + codes)
+    key = np.sort(table.owners * (int(codes.max()) + 1) + codes)
     return np.unique(key[1:][np.diff(key) == 0] // (int(codes.max()) + 1))
-
-
-def ragged(
-    table: Any,
-    begins: np.ndarray,
-    cameras: tuple[Camera, Camera] | list[tuple[Camera, Camera]],
-    sigma: float | None,
-) -> Ragged:
-    """The points of a part in photo coordinates; cameras for all pairs, or of each.
-    Missing numbers are NaN."""
-    numbers = lambda name: np.asarray(
-        table.column(name).cast(pa.float64(), safe=False).to_numpy(), np.float64
-    )
-    each = lambda side, value: _spread(cameras, side, value, begins)
-    photo = []
-    for side, (u, v) in enumerate((("x_left", "y_left"), ("x_right", "y_right"))):
-        size = each(side, lambda c: c.pixel_size)
-        sign = each(side, lambda c: -1.0 if c.y_down else 1.0)
-        photo.append((numbers(u) - each(side, lambda c: c.principal_point[0])) * size)
-        photo.append(
-            (numbers(v) - each(side, lambda c: c.principal_point[1])) * (sign * size)
-        )
-    count = len(table)
-    given = (
-        numbers("sigma")
-        if "sigma" in table.column_names
-        else None
-        if sigma is None
-        else np.full(count, sigma)
-    )
-    deviation = (
-        np.ones(count) if given is None else given * each(0, lambda c: c.pixel_size)
-    )
-    pairs = len(begins) - 1
-    focals = [
-        np.full(pairs, cameras[side].focal)
-        if isinstance(cameras, tuple)
-        else np.array([both[side].focal for both in cameras])
-        for side in (0, 1)
-    ]
-    return Ragged(begins, *photo, deviation, np.ones(count, bool), *focals)
-
-
-def _spread(
-    cameras: Any, side: int, value: Any, begins: np.ndarray
-) -> Float[np.ndarray, "..."]:
-    """A constant of the cameras, for all rows or for each."""
-    if isinstance(cameras, tuple):
-        return np.asarray(value(cameras[side]))
-    return np.repeat(
-        np.array([value(both[side]) for both in cameras], np.float64), np.diff(begins)
-    )
 
 
 def write(table: Any, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Tables of a survey over a grid: CSV text in, a named `grid_survey.Survey` out, or one
+"""Tables of a survey over a grid: CSV text in, a named `surveys.grid_survey.Survey` out, or one
 clear error. All in mm.
 
 readings   point, square, parallax; optionally grid (the grid read at the point),
@@ -10,7 +10,7 @@ traverses  traverse, from, to, back, fore: the legs in order, both readings made
 """
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,31 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..surveys.grid_survey import Measured, Survey, survey
-from ..surveys.networks import unconnected_points
 from ..surveys.planning import Deviations
 from . import fields
 from .fields import Columns, TableError
+from .survey_checks import Row, check_legs, check_reading, check_scale
 
 TEXTS = ("point", "square", "traverse", "from", "to")
 POSITIVE = ("side", "photo_side")
 READINGS = Columns(("point", "square", "parallax"), ("grid", "x", "y", "height"))
 GRID = Columns(("square", "side", "photo_side"), ("parallax", "height"))
 TRAVERSES = Columns(("traverse", "from", "to", "back", "fore"))
-FOCAL = (3.0, 2000.0)
-"""mm: what H l / L, the focal length, may be; outside it some length has another
-unit."""
 LONGEST = 1e9
 """mm: no length is longer, and none shorter than its inverse."""
-SCALE = 1.5
-"""Factor by which squares of one photo may differ in scale."""
-
-
-class Row(NamedTuple):
-    """One line: its number, and what stands in each column (None where an optional
-    field is empty)."""
-
-    line: int
-    cells: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -63,209 +50,137 @@ def rows(text: str, file: str, columns: Columns) -> list[Row]:
     """The lines of CSV text by the names of its columns. Raises TableError."""
     found, line = [], 1
     for line, entries in fields.lines_of(io.StringIO(text, newline=""), file, columns):
-        cells = {
-            c: _cell(entry, file, line, c, c in columns.optional)
-            for c, entry in entries.items()
-        }
-        found.append(Row(line, cells))
+        row = Row(file, line, {})
+        for column, entry in entries.items():
+            row.cells[column] = _cell(entry, row, column, column in columns.optional)
+        found.append(row)
     if not found:
-        raise TableError(
-            file,
-            line=line + 1,
-            found="no lines",
-            expected=f"{columns}, and one line for each below them",
-        )
+        expected = f"{columns}, and one line for each below them"
+        raise TableError(file, line=line + 1, found="no lines", expected=expected)
     return found
 
 
-def _cell(entry: str, file: str, line: int, column: str, optional: bool) -> Any:
+def _cell(entry: str, row: Row, column: str, optional: bool) -> Any:
+    """What a field says. Raises TableError."""
     if column in TEXTS:
-        return fields.name(entry, file, line, column)
+        return fields.name(entry, row.file, row.line, column)
     if optional and not entry:
         return None
-    value = fields.number(entry, file, line, column)
+    value = fields.number(entry, row.file, row.line, column)
     if column in POSITIVE and value <= 0:
-        raise TableError(
-            file,
-            line=line,
-            column=column,
-            found=repr(entry),
-            expected="a positive length in mm",
-        )
+        raise row.error(column, found=repr(entry), expected="a positive length in mm")
     if abs(value) > LONGEST:
-        raise TableError(
-            file,
-            line=line,
-            column=column,
-            found=repr(entry),
-            expected=f"mm, at most {LONGEST:g}",
-        )
+        raise row.error(column, found=repr(entry), expected=f"mm, at most {LONGEST:g}")
     return value
 
 
-def read(path: Path, columns: Columns) -> tuple[str, list[Row]]:
-    """The name of a file and its lines. Raises TableError."""
-    return str(path), rows(fields.read_text(path), str(path), columns)
+def read(path: Path, columns: Columns) -> list[Row]:
+    """The lines of a file. Raises TableError."""
+    return rows(fields.read_text(path), str(path), columns)
 
 
-Table = tuple[str, list[Row]]
-
-
-def assembled(
-    readings: Table,
-    grid: Table,
-    traverses: Table | None,
+def assemble(
+    readings: list[Row],
+    grid: list[Row],
+    traverses: list[Row] | None,
     camera_height: float,
     base: float,
     deviations: Deviations,
 ) -> Named:
     """The survey of these tables. Raises TableError for whatever does not fit
     together."""
-    squares = _numbered(*grid, "square")
-    points = _numbered(*readings, "point")
-    for name, number in points.items():
-        if name in squares:
-            expected = (
-                "a name that no square has: a square's name is that of its corner"
-            )
-            raise TableError(
-                readings[0],
-                line=readings[1][number].line,
-                column="point",
-                found=repr(name),
-                expected=expected,
-            )
-    _check_scale(*grid, camera_height)
-    side, photo_side = (np.array([row.cells[c] for row in grid[1]]) for c in POSITIVE)
-    datum = np.array([row.cells.get("height") or 0.0 for row in grid[1]])
-    square, at_grid, parallax = [], _GridReadings(), []
-    p_c = base * photo_side / side
-    for row in readings[1]:
-        name = row.cells["square"]
-        if name not in squares:
-            raise TableError(
-                readings[0],
-                line=row.line,
-                column="square",
-                found=repr(name),
-                expected=f"a square of {grid[0]}",
-            )
-        k = squares[name]
-        own, there = row.cells.get("grid"), grid[1][k].cells.get("parallax")
-        if own is None and there is None:
-            expected = (
-                "the grid read at the point, or a column parallax with that of square "
-                f"{name!r} in {grid[0]}"
-            )
-            raise TableError(
-                readings[0],
-                line=row.line,
-                column="grid",
-                found="no reading of the grid",
-                expected=expected,
-            )
-        square.append(k)
-        at_grid.add(
-            own if own is not None else there,
-            None if own is not None else k,
-            deviations.grid,
-        )
-        over = camera_height - datum[k]
-        _check_reading(readings[0], row, "parallax", at_grid.of(-1), p_c[k], over)
-        parallax.append(row.cells["parallax"])
-        known_height = row.cells.get("height")
-        if known_height is not None and not -over < known_height - datum[k] < over / 2:
-            expected = (
-                "a height from the zero of the grid and of the camera height, "
-                f"{camera_height:g}"
-            )
-            raise TableError(
-                readings[0],
-                line=row.line,
-                column="height",
-                found=repr(known_height),
-                expected=expected,
-            )
-    height = [row.cells.get("height") for row in readings[1]]
-    names, count = list(points), len(points)
-    start, end, legs = [], [], [] if traverses is None else traverses[1]
-    for row in legs:
-        for column, reading, into in (("from", "back", start), ("to", "fore", end)):
-            name = row.cells[column]
-            if name not in points:
-                if name not in squares:
-                    expected = (
-                        f"a point of {readings[0]}, or a square of {grid[0]} for its "
-                        "corner"
-                    )
-                    file = traverses[0]  # pyright: ignore[reportOptionalSubscript]
-                    raise TableError(
-                        file,
-                        line=row.line,
-                        column=column,
-                        found=repr(name),
-                        expected=expected,
-                    )
-                points[name] = len(names)
-                names.append(name)
-                corner = squares[name]
-                there = grid[1][corner].cells.get("parallax")
-                if there is None:  # the corner is the grid, and this its reading
-                    at_grid.add(row.cells[reading], None, 0.0)
-                else:
-                    at_grid.add(there, corner, deviations.grid)
-                square.append(corner)
-                parallax.append(at_grid.of(-1))
-                height.append(datum[corner])
-            i = points[name]
-            _check_reading(
-                traverses[0],  # pyright: ignore[reportOptionalSubscript]
-                row,
-                reading,
-                at_grid.of(i),
-                float(p_c[square[i]]),
-                float(camera_height - datum[square[i]]),
-            )
-            into.append(i)
-    known = np.array([h is not None for h in height])
-    if traverses is not None:
-        _check_legs(traverses, start, end, known, names)
-    back, fore = (
-        np.array([row.cells[c] for row in legs], float) for c in ("back", "fore")
+    squares = _read_squares(grid, camera_height, base)
+    points = _read_points(readings, squares, deviations)
+    count, legs = len(readings), traverses or []
+    start, end = _read_legs(points, squares, legs, deviations, readings[0].file)
+    known = np.array([height is not None for height in points.height])
+    if legs:
+        check_legs(legs, start, end, known, list(points.numbers))
+    own = np.where(np.arange(len(known)) < count, deviations.point, 0.0)
+    measured = _arrays(
+        camera_height=camera_height,
+        base=base,
+        side=squares.side,
+        photo_side=squares.photo_side,
+        grid=points.grid.values,
+        point=points.parallax,
+        back=np.array([row.cells["back"] for row in legs], float),
+        fore=np.array([row.cells["fore"] for row in legs], float),
     )
-    values = camera_height, base, side, photo_side, at_grid.values, parallax, back, fore
-    point = np.where(np.arange(len(names)) < count, deviations.point, 0.0)
-    d, read = deviations, deviations.point
-    spread = (
-        d.camera_height,
-        d.base,
-        d.side,
-        d.photo_side,
-        at_grid.deviations,
-        point,
-        read,
-        read,
+    spread = _arrays(
+        camera_height=deviations.camera_height,
+        base=deviations.base,
+        side=deviations.side,
+        photo_side=deviations.photo_side,
+        grid=points.grid.deviations,
+        point=own,
+        back=deviations.point,
+        fore=deviations.point,
     )
     made = survey(
-        Measured(*map(jnp.asarray, values)),
-        Measured(*map(jnp.asarray, spread)),
-        square=square,
-        grid=at_grid.number,
-        datum=datum,
+        measured,
+        spread,
+        square=points.square,
+        grid=points.grid.number,
+        datum=squares.datum,
         known=known,
-        height=np.array([h or 0.0 for h in height]),
+        height=np.array([height or 0.0 for height in points.height]),
         start=start,
         end=end,
     )
-    places = [[row.cells.get(axis) for row in readings[1]] for axis in "xy"]
-    whole = not any(value is None for axis in places for value in axis)
+    places = [[row.cells.get(axis) for row in readings] for axis in "xy"]
+    is_complete = not any(value is None for axis in places for value in axis)
     return Named(
-        made,
-        names,
-        list(squares),
-        count,
-        [row.cells["traverse"] for row in legs],
-        np.array(places, float) if whole else None,
+        survey=made,
+        names=list(points.numbers),
+        squares=list(squares.numbers),
+        points=count,
+        traverses=[row.cells["traverse"] for row in legs],
+        places=np.array(places, float) if is_complete else None,
+    )
+
+
+def _arrays(**values: Any) -> Measured:
+    """What was measured, or its standard deviations, as arrays of JAX."""
+    return Measured(**{name: jnp.asarray(value) for name, value in values.items()})
+
+
+class _Squares(NamedTuple):
+    """The squares of the grid: their numbers by name; sides in nature and on the photo,
+    parallaxes p_c and heights of the grid there, the cameras' heights over them."""
+
+    rows: list[Row]
+    numbers: dict[str, int]
+    side: np.ndarray
+    photo_side: np.ndarray
+    p_c: np.ndarray
+    datum: np.ndarray
+    over: np.ndarray
+
+    def parallax(self, square: int) -> float | None:
+        """The reading of the grid in a square, if the table has it."""
+        return self.rows[square].cells.get("parallax")
+
+    def check(self, row: Row, column: str, grid: float, square: int) -> None:
+        """Raises TableError for a reading that no point of the square can have."""
+        p_c, over = float(self.p_c[square]), float(self.over[square])
+        check_reading(row, column, grid, p_c, over)
+
+
+def _read_squares(grid: list[Row], camera_height: float, base: float) -> _Squares:
+    numbers = _number(grid, "square")
+    check_scale(grid, camera_height)
+    side, photo_side = (np.array([row.cells[c] for row in grid]) for c in POSITIVE)
+    datum = np.array([row.cells.get("height") or 0.0 for row in grid])
+    p_c = base * photo_side / side
+    return _Squares(
+        rows=grid,
+        numbers=numbers,
+        side=side,
+        photo_side=photo_side,
+        p_c=p_c,
+        datum=datum,
+        over=camera_height - datum,
     )
 
 
@@ -296,149 +211,128 @@ class _GridReadings:
         return self.values[self.number[point]]
 
 
-def _numbered(file: str, table: list[Row], column: str) -> dict[str, int]:
+@dataclass
+class _Points:
+    """Points as they are met: their numbers by name, square, reading, height (None
+    where it is not known), and reading of the grid."""
+
+    numbers: dict[str, int]
+    square: list[int] = field(default_factory=list)
+    parallax: list[float] = field(default_factory=list)
+    height: list[float | None] = field(default_factory=list)
+    grid: _GridReadings = field(default_factory=_GridReadings)
+
+
+def _read_points(
+    readings: list[Row], squares: _Squares, deviations: Deviations
+) -> _Points:
+    """The points of the table of readings. Raises TableError."""
+    points = _Points(_number(readings, "point"))
+    for name, number in points.numbers.items():
+        if name in squares.numbers:
+            raise readings[number].error(
+                "point",
+                found=repr(name),
+                expected="a name that no square has: a square's name is that of its "
+                "corner",
+            )
+    grid_file = squares.rows[0].file
+    for row in readings:
+        name = row.cells["square"]
+        if name not in squares.numbers:
+            expected = f"a square of {grid_file}"
+            raise row.error("square", found=repr(name), expected=expected)
+        square = squares.numbers[name]
+        own, there = row.cells.get("grid"), squares.parallax(square)
+        if own is None and there is None:
+            raise row.error(
+                "grid",
+                found="no reading of the grid",
+                expected="the grid read at the point, or a column parallax with that "
+                f"of square {name!r} in {grid_file}",
+            )
+        if own is None:
+            points.grid.add(there, square, deviations.grid)
+        else:
+            points.grid.add(own, None, deviations.grid)
+        squares.check(row, "parallax", points.grid.of(-1), square)
+        height, over = row.cells.get("height"), squares.over[square]
+        if height is not None and not (
+            -over < height - squares.datum[square] < over / 2
+        ):
+            camera_height = over + squares.datum[square]
+            raise row.error(
+                "height",
+                found=repr(height),
+                expected="a height from the zero of the grid and of the camera height, "
+                f"{camera_height:g}",
+            )
+        points.square.append(square)
+        points.parallax.append(row.cells["parallax"])
+        points.height.append(height)
+    return points
+
+
+def _read_legs(
+    points: _Points,
+    squares: _Squares,
+    legs: list[Row],
+    deviations: Deviations,
+    readings_file: str,
+) -> tuple[list[int], list[int]]:
+    """The numbers of the points where the legs begin and end; corners of squares become
+    points. Raises TableError."""
+    start, end = [], []
+    for row in legs:
+        for column, reading, into in (("from", "back", start), ("to", "fore", end)):
+            name = row.cells[column]
+            if name not in points.numbers:
+                if name not in squares.numbers:
+                    raise row.error(
+                        column,
+                        found=repr(name),
+                        expected=f"a point of {readings_file}, or a square of "
+                        f"{squares.rows[0].file} for its corner",
+                    )
+                _add_corner(points, squares, name, row.cells[reading], deviations)
+            number = points.numbers[name]
+            grid = points.grid.of(number)
+            squares.check(row, reading, grid, points.square[number])
+            into.append(number)
+    return start, end
+
+
+def _add_corner(
+    points: _Points,
+    squares: _Squares,
+    name: str,
+    reading: float,
+    deviations: Deviations,
+) -> None:
+    """The corner of a square as a point of known height, which was read on a leg."""
+    square = squares.numbers[name]
+    there = squares.parallax(square)
+    if there is None:  # the corner is the grid, and this its reading
+        points.grid.add(reading, None, 0.0)
+    else:
+        points.grid.add(there, square, deviations.grid)
+    points.numbers[name] = len(points.square)
+    points.square.append(square)
+    points.parallax.append(points.grid.of(-1))
+    points.height.append(squares.datum[square])
+
+
+def _number(table: list[Row], column: str) -> dict[str, int]:
     """The numbers of the lines by their names, each of which may stand once."""
     numbers: dict[str, int] = {}
     for row in table:
         name = row.cells[column]
         if name in numbers:
-            found = (
-                f"{name!r} a second time (first on line {table[numbers[name]].line})"
-            )
-            raise TableError(
-                file,
-                line=row.line,
-                column=column,
-                found=found,
+            first = table[numbers[name]].line
+            raise row.error(
+                column,
+                found=f"{name!r} a second time (first on line {first})",
                 expected=f"each {column} once; of repeated readings give the mean",
             )
         numbers[name] = len(numbers)
     return numbers
-
-
-def _check_scale(file: str, grid: list[Row], camera_height: float) -> None:
-    """All squares below the cameras, and in the scales of one camera."""
-    focal = []
-    for row in grid:
-        datum = row.cells.get("height") or 0.0
-        if datum >= camera_height:
-            expected = (
-                f"less than the camera height of {camera_height:g}, which counts from "
-                "the same zero"
-            )
-            raise TableError(
-                file,
-                line=row.line,
-                column="height",
-                found=repr(datum),
-                expected=expected,
-            )
-        focal.append(
-            row.cells["photo_side"] / row.cells["side"] * (camera_height - datum)
-        )
-    usual = float(np.median(focal))
-    for row, one in zip(grid, focal, strict=True):
-        if not usual / SCALE < one < usual * SCALE:
-            found = f"{row.cells['photo_side']!r}, so a focal length of {one:.4g} mm"
-            raise TableError(
-                file,
-                line=row.line,
-                column="photo_side",
-                found=found,
-                expected=f"that of the other squares, {usual:.4g} mm",
-            )
-    if not FOCAL[0] < usual < FOCAL[1]:
-        found = f"squares of a photo with a focal length of {usual:.4g} mm"
-        expected = (
-            "side, photo_side, --camera-height all in mm, heights and --camera-height "
-            "from one zero"
-        )
-        raise TableError(file, column="photo_side", found=found, expected=expected)
-
-
-def _check_reading(
-    file: str, row: Row, column: str, grid: float, p_c: float, camera_height: float
-) -> None:
-    """A point between half the camera height over the grid and the whole below it."""
-    reading = row.cells[column]
-    dp = reading - grid
-    if reading == 0 and abs(dp) > p_c / 2:
-        raise TableError(
-            file,
-            line=row.line,
-            column=column,
-            found="a reading of 0",
-            expected="the reading of the point; delete the line without",
-        )
-    if p_c + dp <= 0:
-        found = (
-            f"{reading!r}, {-dp:.4g} mm less than the grid's {grid!r}: no point has "
-            f"the parallax {p_c + dp:.4g}"
-        )
-    elif not -camera_height < camera_height * dp / (p_c + dp) < camera_height / 2:
-        h = camera_height * dp / (p_c + dp)
-        found = (
-            f"{reading!r} where the grid has {grid!r}: a point {abs(h):.4g} mm "
-            f"{'over' if h > 0 else 'below'} it"
-        )
-    else:
-        return
-    raise TableError(
-        file,
-        line=row.line,
-        column=column,
-        found=found,
-        expected="a reading in mm, from the same zero as those of the grid",
-    )
-
-
-def _check_legs(
-    table: Table, start: list[int], end: list[int], known: np.ndarray, names: list[str]
-) -> None:
-    """Legs that lead somewhere, one behind the other, from points of known height."""
-    file, legs = table
-    last: dict[str, str] = {}
-    for row, a, b in zip(legs, start, end, strict=True):
-        if a == b:
-            raise TableError(
-                file,
-                line=row.line,
-                column="to",
-                found=repr(names[b]),
-                expected="another point than the leg comes from",
-            )
-        name = row.cells["traverse"]
-        if last.get(name, names[a]) != names[a]:
-            found, expected = (
-                repr(names[a]),
-                f"{last[name]!r}, where the leg before it of traverse {name!r} ends",
-            )
-            raise TableError(
-                file, line=row.line, column="from", found=found, expected=expected
-            )
-        last[name] = names[b]
-    used = np.unique([start, end])
-    lost = set(
-        used[
-            unconnected_points(
-                np.searchsorted(used, start), np.searchsorted(used, end), known[used]
-            )
-        ].tolist()
-    )
-    for row, a in zip(legs, start, strict=True):
-        if a in lost:
-            found = f"{names[a]!r}, which no legs join to a known height"
-            raise TableError(
-                file,
-                line=row.line,
-                column="from",
-                found=found,
-                expected="a corner of the grid, or a point with a known height",
-            )
-    if known[used].all():
-        raise TableError(
-            file,
-            line=legs[0].line,
-            found="legs between known heights alone",
-            expected="points whose heights are sought",
-        )

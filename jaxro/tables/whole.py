@@ -2,8 +2,8 @@
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .fields import TableError
@@ -50,14 +50,32 @@ def check_name(path: Path, expected: str) -> None:
     whole = path.resolve()
     if not whole.name:
         raise TableError(path, found="the root of all folders", expected=expected)
-    try:
+    with telling(path, expected), suppress(FileNotFoundError):
         whole.with_name(f".{whole.name}.{os.getpid()}.unfinished.old").lstat()
-    except FileNotFoundError:
-        pass
+
+
+@contextmanager
+def telling(path: Path, expected: str) -> Iterator[None]:
+    """What the disk refuses is told as a TableError."""
+    try:
+        yield
     except OSError as error:
-        raise TableError(
-            path, found=error.strerror or str(error), expected=expected
-        ) from None
+        found = error.strerror or str(error)
+        raise TableError(path, found=found, expected=expected) from None
+
+
+@contextmanager
+def draft_of(path: Path, draft: Path | None = None) -> Iterator[Path]:
+    """A file to write, beside `path` if not given, which takes the place of `path` when
+    it is complete. Of an error nothing is left."""
+    draft = draft or path.with_suffix(".partial")
+    draft.unlink(missing_ok=True)
+    try:
+        yield draft
+        os.replace(draft, path)
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
 
 
 def write(
@@ -69,52 +87,39 @@ def write(
     Raises TableError, with nothing written, where the disk refuses, or one would take
     the place of a file that was `read`.
     """
+    targets = [(directory / name).resolve() for name in texts]
     for file in read:
-        if file is not None and file.resolve() in [
-            (directory / name).resolve() for name in texts
-        ]:
+        if file is not None and file.resolve() in targets:
             raise TableError(
                 file,
                 found="a table to be read where a result is to be written",
                 expected="another --out",
             )
-    draft = directory.absolute().with_name(
-        f".{directory.absolute().name}.{os.getpid()}.partial"
-    )
+    draft = _hidden(directory)
     try:
-        draft.mkdir(parents=True)
-        for name, text in texts.items():
-            (draft / name).write_bytes(
-                text if isinstance(text, bytes) else text.encode()
-            )
-        if directory.exists():
-            for name in texts:
-                os.replace(draft / name, directory / name)
-        else:
-            os.replace(draft, directory)
-    except OSError as error:
-        raise TableError(
-            directory,
-            found=error.strerror or str(error),
-            expected="a folder that can be written",
-        ) from None
+        with telling(directory, "a folder that can be written"):
+            draft.mkdir(parents=True)
+            for name, text in texts.items():
+                content = text if isinstance(text, bytes) else text.encode()
+                (draft / name).write_bytes(content)
+            if directory.exists():
+                for name in texts:
+                    os.replace(draft / name, directory / name)
+            else:
+                os.replace(draft, directory)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
 
 
 def write_file(path: Path, text: str) -> None:
     """The whole file or none. Raises TableError."""
-    draft = path.absolute().with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        draft.parent.mkdir(parents=True, exist_ok=True)
-        draft.write_text(text, encoding="utf-8", newline="")
-        os.replace(draft, path)
-    except OSError as error:
-        raise TableError(
-            path,
-            found=error.strerror or str(error),
-            expected="a file that can be written",
-        ) from None
-    finally:
-        with suppress(OSError):
-            draft.unlink(missing_ok=True)
+    with telling(path, "a file that can be written"):
+        path.absolute().parent.mkdir(parents=True, exist_ok=True)
+        with draft_of(path, _hidden(path)) as draft:
+            draft.write_text(text, encoding="utf-8", newline="")
+
+
+def _hidden(path: Path) -> Path:
+    """Where the draft of a file or a folder of the user is written."""
+    whole = path.absolute()
+    return whole.with_name(f".{whole.name}.{os.getpid()}.partial")

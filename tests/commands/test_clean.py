@@ -5,7 +5,6 @@ import csv
 import json
 import math
 
-import jax
 import numpy as np
 import pytest
 from bad_tables import write
@@ -16,7 +15,7 @@ from jaxro.cli import app
 from jaxro.commands import tolerances
 from jaxro.geometry import mock_pairs
 from jaxro.rejection import OUTCOMES, PROCEDURES, Dorozhinsky, TwoStage
-from jaxro.reports import verdicts
+from jaxro.reports import columns, verdicts
 from jaxro.tables import csv as tables
 from jaxro.tables.examples import mock_pair as mock_example
 
@@ -113,11 +112,12 @@ def test_the_log_is_that_of_python_to_the_last_digit(cleaned, sample):
     pair = jaxro.pair(
         *measured.coordinates, focal=mock_example.FOCAL, sigma=measured.sigma
     )
-    _, batch = jaxro.clean_batch(
+    of_pair, of_points = jaxro.clean_batch(
         jaxro.stack([pair]), Dorozhinsky(), select=verdicts.with_log
     )
-    found = jax.tree.map(lambda a: a[0], batch)
-    happened = np.asarray(found.happened)
+    every = of_pair["rounds"] | of_points["rounds"]
+    found = {name: np.asarray(values[0]) for name, values in every.items()}
+    happened = found["happened"]
     log = rows(out / "decisions.csv")
     numbers = [int(row["round"]) for row in log]
     assert sorted(set(numbers)) == list(range(1, happened.sum() + 1))
@@ -126,19 +126,19 @@ def test_the_log_is_that_of_python_to_the_last_digit(cleaned, sample):
     )  # a rejected point is in no later round
     table = {(int(row["round"]), row["point"]): row for row in log}
     for number, place in enumerate(np.flatnonzero(happened), 1):
-        limit = float(found.limit[place])
+        limit = float(found["limit"][place])
         for i, name in enumerate(measured.points):
             row = table.get((number, name))
             if row is None:
                 continue
-            wanted = found.statistic[place, i], found.parallax[place, i]
+            wanted = found["statistic"][i, place], found["parallax"][i, place]
             assert (float(row["statistic"]), float(row["parallax_mm"])) == tuple(
                 map(float, wanted)
             )
             assert (row["limit"] == "") == math.isinf(limit) and (
                 not row["limit"] or float(row["limit"]) == limit
             )
-            assert (row["rejected"] == "true") == bool(found.rejected[place, i])
+            assert (row["rejected"] == "true") == bool(found["rejected"][i, place])
     summary = json.loads(
         (out / "decisions.json").read_text(), parse_constant=pytest.fail
     )
@@ -155,9 +155,7 @@ def test_the_log_is_that_of_python_to_the_last_digit(cleaned, sample):
         [row[f"{n}_deg"] for n in jaxro.IndependentElements.names]
         for row in only["elements"]
     ]
-    np.testing.assert_array_equal(
-        elements, np.rad2deg(np.asarray(found.elements)[happened])
-    )
+    np.testing.assert_array_equal(elements, np.rad2deg(found["elements"][happened]))
 
 
 def table_1(points):
@@ -302,7 +300,7 @@ def test_what_judges_by_sigma_is_not_run_without_one(tmp_path):
 
 
 def test_tolerances_reach_every_part():
-    changed = tolerances.changed(
+    changed = tolerances.change(
         TwoStage(), ["eps3=0.2", "second.level=0.01", "exact=false", "first.least=7"]
     )
     assert (
@@ -318,7 +316,7 @@ def test_tolerances_reach_every_part():
         for name, value in tolerances.tolerances(procedure).items():
             text = "0.5" if value is None else str(value).lower()
             after = tolerances.tolerances(
-                tolerances.changed(procedure, [f"{name}={text}"])
+                tolerances.change(procedure, [f"{name}={text}"])
             )
             assert after == {
                 **tolerances.tolerances(procedure),
@@ -344,12 +342,11 @@ def test_nothing_is_left_of_a_result_that_could_not_be_written(
 
 
 def test_every_outcome_has_a_name_and_advice():
-    assert (
-        verdicts.NAMES[int(OUTCOMES.finished._value)] == "finished"
-        and not verdicts.ADVICE["finished"]
-    )
+    number = int(OUTCOMES.finished._value)
+    assert columns.OUTCOME_NAMES[number] == "finished"
+    assert not columns.OUTCOME_ADVICE["finished"]
     assert all(
-        verdicts.ADVICE[name]
+        columns.OUTCOME_ADVICE[name]
         for name in ("operator_needed", "nothing_to_test", "not_oriented")
     )
 

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from jaxro.cli import app
 from jaxro.commands import large
-from jaxro.commands.orient import Options
-from jaxro.commands.stream import JOURNAL, here
+from jaxro.commands.journal import JOURNAL, here
+from jaxro.commands.request import Options
 from jaxro.tables.fields import TableError
 
 pa = pytest.importorskip("pyarrow")
@@ -173,7 +173,7 @@ def stopped(folder: Path, out: Path, parts: int) -> None:
     """A run in a process of its own, killed when its journal has so many parts."""
     script = (
         "import sys, pathlib; from jaxro.commands import large; from "
-        "jaxro.commands.orient import Options; p = pathlib.Path;"
+        "jaxro.commands.request import Options; p = pathlib.Path;"
         f"large.run(Options(file=p(sys.argv[1]), focal={FOCAL}, out=p(sys.argv[2])),"
         "large.Large(part_rows=200, tables='elements,residuals,points,reliability'))"
     )
@@ -711,7 +711,7 @@ import os, signal, subprocess, sys, pathlib
 import ray
 from jaxro.commands import cluster
 from jaxro.commands import large
-from jaxro.commands.orient import Options
+from jaxro.commands.request import Options
 
 if __name__ == "__main__":
     ray.init(num_cpus=2, log_to_driver=False)

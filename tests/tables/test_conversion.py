@@ -22,7 +22,7 @@ ODD_TEXTS = {
 def test_an_odd_table_is_converted_to_what_is_read_of_it(text, tmp_path):
     source, target = tmp_path / "odd.csv", tmp_path / "odd.parquet"
     source.write_text(text)
-    conversion.converted(source, target)
+    conversion.convert(source, target)
     found = pq.read_table(target)
     expected = [
         (m.name, point, *row)

@@ -1,0 +1,195 @@
+"""How far the work on a table of any size is: a journal in the folder of its results.
+
+    DIR.unfinished/       while the work goes on; no DIR until all of it is there
+        journal.jsonl     what was asked for, then one line for each finished part
+        elements/part-00000.parquet, residuals/..., points/...
+    DIR/                  the same folder, renamed at the end
+
+The files of a part are complete before its line in the journal is, so that a run that
+was stopped at any moment goes on with the first part that has no line, and ends in the
+same bytes.
+"""
+
+import json
+import os
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ..reports.files import json_text
+from ..tables import whole
+from ..tables.fields import TableError
+from .stream import CONVERTED, Part, Work, Worker, part_file
+
+JOURNAL = "journal.jsonl"
+
+MODIFIED = "modified_ns"
+"""When the files that were read were written: part of a request, by which another one
+is known, not of a summary."""
+
+
+class Job:
+    """A table of any size, what is to be done with it, and how far it is."""
+
+    def __init__(
+        self, work: Work, parts: list[Part], target: Path, request: dict[str, Any]
+    ):
+        self.work, self.parts, self.target, self.request = work, parts, target, request
+        self.entries: list[dict[str, Any]] = []
+
+    @property
+    def pairs(self) -> int:
+        """All pairs of the table."""
+        return sum(len(part.begins) - 1 for part in self.parts)
+
+    @property
+    def left(self) -> list[Part]:
+        """The parts that are not finished."""
+        done = {entry["part"] for entry in self.entries}
+        return [part for part in self.parts if part.number not in done]
+
+    @property
+    def done(self) -> int:
+        """Pairs in finished parts."""
+        return sum(entry["pairs"] for entry in self.entries)
+
+    @property
+    def has_journal(self) -> bool:
+        """Whether there is a journal that says what was asked for."""
+        path = self.work.folder / JOURNAL
+        return path.exists() and any(True for _ in _whole_lines(path))
+
+    def begin(self) -> None:
+        """A new journal. Raises TableError where the folder cannot be written."""
+        with whole.telling(self.work.folder, "a folder that can be written"):
+            self.work.folder.mkdir(parents=True, exist_ok=True)
+            self._rewrite()
+
+    def go_on(self) -> None:
+        """What an earlier run finished. Raises TableError where it was asked for
+        something else."""
+        path = self.work.folder / JOURNAL
+        lines = list(_whole_lines(path))
+        before = lines[0].get("request", {})
+        for key in sorted(set(before) | set(self.request)):
+            if before.get(key) != self.request.get(key):
+                found = (
+                    f"{key} = {before.get(key)!r} in the run to be resumed, "
+                    f"{self.request.get(key)!r} now"
+                )
+                raise TableError(
+                    path,
+                    line=1,
+                    found=found,
+                    expected="the same table and options, or a new --out",
+                )
+        self.entries = [entry for entry in lines[1:] if self._stands(entry)]
+        self._rewrite()  # without a line that was cut off
+
+    def add(self, entry: dict[str, Any]) -> None:
+        """A part is written: its line in the journal."""
+        _append(self.work.folder / JOURNAL, entry)
+        self.entries.append(entry)
+
+    def end(self) -> dict[str, Any]:
+        """The summary, when every part is finished; the folder takes its name."""
+        told = self._totals()
+        asked = {key: value for key, value in self.request.items() if key != MODIFIED}
+        sigma0 = self.work.units.sigma0 or None
+        units = asdict(self.work.units) | {"sigma0": sigma0, "angles": "deg"}
+        with whole.draft_of(self.work.folder / "summary.json") as draft:
+            draft.write_text(
+                json_text({**asked, **told, "units": units}), encoding="utf-8"
+            )
+        self._rename()
+        return told
+
+    def _totals(self) -> dict[str, Any]:
+        """The numbers of pairs, rows, results and outcomes in all parts."""
+        self.entries.sort(key=lambda entry: entry["part"])
+        told: dict[str, Any] = {
+            "pairs": self.done,
+            "rows": sum(entry["rows"] for entry in self.entries),
+        }
+        for key in ("results", "outcomes"):
+            total: Counter = Counter()
+            for entry in self.entries:
+                total.update(entry[key])
+            told |= {key: dict(sorted(total.items()))} if total else {}
+        doubles = [name for entry in self.entries for name in entry["doubles"]]
+        return told | {"pairs_with_two_points_of_one_name": doubles}
+
+    def _rename(self) -> None:
+        """The folder takes its name, and the place of one of that name."""
+        folder, target = self.work.folder, self.target
+        for stray in (*folder.rglob("*.partial"), folder / CONVERTED):
+            stray.unlink(missing_ok=True)
+        if target.exists():
+            os.replace(target, target.with_name(f".{target.name}.{os.getpid()}.old"))
+        os.replace(folder, target)
+        # what was replaced by this run, or by one that was killed
+        replaced = re.compile(rf"\.{re.escape(target.name)}\.\d+\.old")
+        for old in list(target.parent.iterdir()):
+            if replaced.fullmatch(old.name):
+                shutil.rmtree(old)
+        # last: a run that is stopped before can still be resumed
+        (target / JOURNAL).unlink()
+
+    def _rewrite(self) -> None:
+        """The journal of what is known, whole or as it was."""
+        with whole.draft_of(self.work.folder / JOURNAL) as draft:
+            _append(draft, {"request": self.request}, *self.entries)
+
+    def _stands(self, entry: dict[str, Any]) -> bool:
+        """Whether the files of a finished part are what they were."""
+        for name, size in entry["files"].items():
+            path = part_file(self.work.folder, name, entry["part"])
+            if not (path.exists() and path.stat().st_size == size):
+                return False
+        return True
+
+
+def _append(path: Path, *entries: dict[str, Any]) -> None:
+    with path.open("a", encoding="utf-8") as file:
+        file.writelines(json.dumps(entry) + "\n" for entry in entries)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _whole_lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The lines of a journal up to one that was cut off."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError:
+        raise TableError(
+            path,
+            found="no journal",
+            expected="the --out of a run that was stopped, to resume it",
+        ) from None
+    for line in text.splitlines(keepends=True):
+        try:
+            entry = json.loads(line) if line.endswith("\n") else None
+        except json.JSONDecodeError:
+            entry = None
+        if not isinstance(entry, dict):
+            return
+        yield entry
+
+
+def previous_request(folder: Path) -> dict[str, Any]:
+    """What the run in this folder was asked for; nothing where it has no journal."""
+    lines = _whole_lines(folder / JOURNAL) if (folder / JOURNAL).exists() else iter(())
+    return next(lines, {}).get("request", {})
+
+
+def here(job: Job, told: Callable[[int], None]) -> Iterable[dict[str, Any]]:
+    """The lines of all parts that are left, worked on in this process."""
+    worker, done = Worker(job.work), job.done
+    for part in job.left:
+        entry = worker(part, lambda number, before=done: told(before + number))
+        done += entry["pairs"]
+        yield entry

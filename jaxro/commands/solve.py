@@ -1,0 +1,331 @@
+"""Clean and orient pairs of any lengths: the one way of CSV and Parquet tables, of few
+pairs and many. A table of a single pair goes through programs of one pair, which compile
+sooner."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from ..batches.batch import clean_batch
+from ..batches.buckets import by_size, choose, map_ragged, rows_of
+from ..batches.padding import Plan
+from ..batches.ragged import Ragged, clean_ragged, orient_ragged
+from ..geometry import coplanarity
+from ..geometry.elements import AbstractElements, DependentElements
+from ..geometry.pairs import Pair
+from ..orientation.orient import Orientation, orient
+from ..orientation.results import RESULTS
+from ..rejection import AbstractProcedure
+from ..reports.columns import USABLE, Units, columns_of, is_usable
+from ..reports.model import Results
+from ..reports.reader import Assessor, Oriented, Reader
+from ..reports.verdicts import (
+    Rounds,
+    Verdicts,
+    join_rounds,
+    read_rounds,
+    unusable,
+    with_log,
+    without_log,
+)
+from ..tables.measured import CameraPairs, Table, one_pair
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
+
+RESIDUALS = {"rigorous": coplanarity.rigorous, "parallax": coplanarity.parallax}
+"""What is minimised, by the names of the command line."""
+
+LOG_NUMBERS = 4_000_000
+"""Entries of the log, (pair, round, point), that may be in memory at once: some 100
+MB."""
+
+Told = Callable[[int], None]
+"""Is told the number of pairs that are finished."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be done with every pair. `tables`: of `columns.TABLES`, those of the
+    points that are wanted; `rounds`: whether every round of the procedure is."""
+
+    system: type[AbstractElements]
+    tables: tuple[str, ...]
+    sigma_known: bool
+    base: float | None = None
+    residual: str = "rigorous"
+    procedure: AbstractProcedure | None = None
+    rounds: bool = False
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """The options of `jaxro.orient` and `jaxro.orient_batch`."""
+        residual = RESIDUALS[self.residual]
+        return {"elements": self.system, "base": self.base, "residual": residual}
+
+    @property
+    def reader(self) -> Reader:
+        """Reads what is wanted of an orientation; reliability needs the points."""
+        wanted = self.tables
+        if "reliability" in wanted and "points" not in wanted:
+            wanted = (*wanted, "points")
+        return Reader(self.system, wanted, self.procedure is not None)
+
+    @property
+    def assessor(self) -> Assessor:
+        """Reads what is wanted of the reliability."""
+        return Assessor(self.system, self.sigma_known)
+
+
+class Found(NamedTuple):
+    """The columns of the pairs and, by table, of their points, in the rows of all; of
+    cleaned pairs the outcomes, the columns of a `verdicts.Decision`, and the rounds."""
+
+    of_pairs: dict[str, Any]
+    of_points: dict[str, dict[str, Any]]
+    outcome: Int[np.ndarray, " pair"] | None = None
+    decided: dict[str, Any] | None = None
+    rounds: Rounds | None = None
+
+
+def solve(
+    pairs: Ragged,
+    task: Task,
+    plan: Plan | None,
+    threads: int | None = None,
+    told: Told = lambda done: None,
+) -> Found:
+    """What is found of the pairs, in NumPy. `plan` is None where the table has one pair
+    only."""
+    if task.procedure is None:
+        return Found(*_orient(pairs, task, plan, threads, told))
+    outcome, decided, rounds = _clean(pairs, task, plan, threads, told)
+    # of unusable points the orientation tells
+    use = decided["kept"] | unusable(decided["kept"], decided["order"])
+    pairs = pairs._replace(mask=pairs.mask & use)
+    found = _orient(pairs, task, plan, threads, lambda done: None)
+    return Found(*found, outcome, decided, rounds)
+
+
+def _orient(
+    pairs: Ragged, task: Task, plan: Plan | None, threads: int | None, told: Told
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """The columns of the pairs and of their points."""
+    if plan is None:
+        pair = one_pair(pairs, 0)
+        orientation = orient(pair, **task.keywords)
+        read = Program(_read, {"reader": task.reader}, COMPILE_FAST)(
+            (pair, orientation)
+        )
+        of_pair, of_points = jax.tree.map(np.asarray, read)
+        of_pairs = jax.tree.map(lambda a: a[None], of_pair)
+        told(1)
+    else:
+        of_pairs, of_points = orient_ragged(
+            pairs,
+            read=task.reader,
+            plan=plan,
+            threads=threads,
+            progress=lambda done, total: told(done),
+            **task.keywords,
+        )
+    if "reliability" in task.tables:
+        assessed = _assess(pairs, of_pairs, of_points, task, plan, threads)
+        of_points = of_points | {"reliability": assessed}
+    used = np.add.reduceat(pairs.mask.astype(int), pairs.begins[:-1])
+    return _hide(of_pairs | {"used": used}, of_points, pairs, task)
+
+
+def _hide(
+    of_pairs: dict[str, Any],
+    of_points: dict[str, dict[str, Any]],
+    pairs: Ragged,
+    task: Task,
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """The columns without the values of results that are not usable. Residuals stay
+    where points lie behind a photo: they say which."""
+    usable = is_usable(of_pairs["result"])
+    behind = of_pairs["result"] == int(RESULTS.points_behind_camera._value)
+    missing = {
+        "usable": np.flatnonzero(~usable),
+        "shown": np.flatnonzero(~(usable | behind)),
+    }
+    of_rows = {
+        name: np.concatenate([*rows_of(pairs, members), np.zeros(0, int)]).astype(int)
+        for name, members in missing.items()
+    }
+
+    def hide(table: str, values: dict[str, Any], places: dict[str, np.ndarray]) -> Any:
+        there = {c.name: c for c in columns_of(table, task.system)}
+        return {n: there[n].hide(np.asarray(a), places) for n, a in values.items()}
+
+    hidden = {name: hide(name, a, of_rows) for name, a in of_points.items()}
+    return hide("elements", of_pairs, missing), hidden
+
+
+def _read(pair_and_orientation: tuple[Pair, Orientation], *, reader: Reader) -> Any:
+    return reader(*pair_and_orientation)
+
+
+def _assess(
+    pairs: Ragged,
+    of_pairs: dict[str, Any],
+    of_points: dict[str, dict[str, Any]],
+    task: Task,
+    plan: Plan | None,
+    threads: int | None,
+) -> dict[str, Any]:
+    """The columns of the reliability of all points, which is defined at the minimum of
+    the rigorous residuals only."""
+    if task.residual != "rigorous":
+        columns = [c for c in columns_of("reliability", task.system) if c.of]
+        empty = lambda c: np.full(len(pairs.x_left), -1 if c.names else np.nan)
+        return {column.name: empty(column) for column in columns}
+    usable = is_usable(of_pairs["result"])
+    # of dependent elements the base is given; of independent ones model heights tell it
+    base = of_pairs["bx"] if task.system is DependentElements else np.ones(len(usable))
+    height = of_points["points"]["Z"]
+
+    def batch_of(members: np.ndarray, size: int) -> Oriented:
+        return Oriented(
+            pair=pairs.pad_to(members, size),
+            usable=usable[members],
+            degrees_of_freedom=of_pairs["degrees_of_freedom"][members],
+            pose=of_pairs["pose"][members],
+            base=base[members],
+            z=pairs._replace(x_left=height).pad_to(members, size).x_left,
+        )
+
+    if plan is not None:
+        return map_ragged(task.assessor, pairs, batch_of, plan, threads)
+    one = jax.tree.map(lambda a: a[0], batch_of(np.zeros(1, int), len(pairs.x_left)))
+    found = Program(_assess_one, {"assessor": task.assessor}, COMPILE_FAST)(one)
+    return jax.tree.map(np.asarray, found)
+
+
+def _assess_one(oriented: Oriented, *, assessor: Assessor) -> Any:
+    return assessor(oriented)
+
+
+def _clean(
+    pairs: Ragged, task: Task, plan: Plan | None, threads: int | None, told: Told
+) -> tuple[Any, dict[str, Any], Rounds | None]:
+    """The outcomes, the decision about every point, and the rounds if they are
+    wanted."""
+    assert task.procedure is not None
+    if plan is None:
+        size = int(pairs.lengths[0])
+        select = with_log if task.rounds else without_log
+        batch = pairs.pad_to(np.zeros(1, int), size)
+        found = clean_batch(batch, task.procedure, select=select, threads=threads)
+        of_pair, of_points = jax.tree.map(np.asarray, found)
+        of_points = jax.tree.map(lambda a: a[0], of_points)
+        told(1)
+    elif not task.rounds:
+        of_pair, of_points = clean_ragged(
+            pairs,
+            task.procedure,
+            select=without_log,
+            plan=plan,
+            threads=threads,
+            progress=lambda done, total: told(done),
+        )
+    else:
+        return _clean_with_rounds(pairs, task, plan, threads, told)
+    rounds = None
+    if task.rounds:
+        of_round = jax.tree.map(lambda a: a[0], of_pair["rounds"])
+        rounds = read_rounds(of_round, of_points.pop("rounds"))
+    return of_pair["outcome"], of_points, rounds
+
+
+def _clean_with_rounds(
+    pairs: Ragged, task: Task, plan: Plan, threads: int | None, told: Told
+) -> tuple[Any, dict[str, Any], Rounds]:
+    """The same with the rounds, which take much memory: not all pairs together."""
+    assert task.procedure is not None
+    each: dict[int, Rounds] = {}
+    outcome = np.zeros(len(pairs.lengths), int)
+    decided: dict[str, Any] = {}
+    most = lambda size: max(1, LOG_NUMBERS // size**2)
+    slabs = dict(zip(plan.sizes, plan.slabs, strict=True))
+    for members, size in by_size(pairs, plan, most):
+        rows, finished = rows_of(pairs, members), len(each)
+        part = choose(pairs, members, rows)
+        of_pairs, of_points = clean_ragged(
+            part,
+            task.procedure,
+            select=with_log,
+            plan=Plan((size,), (slabs[size],), (size,)),
+            threads=threads,
+            progress=lambda done, total, before=finished: told(before + done),
+        )
+        log = of_points.pop("rounds")
+        found = _part_rounds(of_pairs["rounds"], log, part.begins)
+        each.update(zip(members.tolist(), found, strict=True))
+        outcome[members] = of_pairs["outcome"]
+        for name, values in of_points.items():
+            everywhere = np.zeros(pairs.x_left.shape, values.dtype)
+            decided.setdefault(name, everywhere)[np.concatenate(rows)] = values
+    rounds = join_rounds([each[k] for k in range(len(each))], pairs.begins[:-1])
+    return outcome, decided, rounds
+
+
+def _part_rounds(
+    of_pairs: dict[str, Any], of_points: dict[str, Any], begins: np.ndarray
+) -> list[Rounds]:
+    """The rounds of pairs that begin with these rows."""
+    spans = zip(begins[:-1].tolist(), begins[1:].tolist(), strict=True)
+    return [
+        read_rounds(
+            {name: values[k] for name, values in of_pairs.items()},
+            {name: values[begin:end] for name, values in of_points.items()},
+        )
+        for k, (begin, end) in enumerate(spans)
+    ]
+
+
+def make_results(
+    table: Table,
+    cameras: CameraPairs,
+    found: Found,
+    task: Task,
+    units: Units,
+    **more: Any,
+) -> Results:
+    """What is found of the pairs of a table, with its points that were kept."""
+    of_pairs, of_points = found.of_pairs, found.of_points
+    if found.decided is not None:
+        rows = np.flatnonzero(found.decided["kept"])
+        table = table.choose(rows)
+        of_points = jax.tree.map(lambda column: column[rows], of_points)
+        of_pairs = of_pairs | {"outcome": found.outcome}
+    return Results(
+        table=table,
+        cameras=cameras,
+        system=task.system,
+        units=units,
+        sigma_known=task.sigma_known,
+        of_pairs=of_pairs,
+        of_points=of_points,
+        **more,
+    )
+
+
+def make_verdicts(table: Table, found: Found) -> Verdicts:
+    """The decisions about the points of a table."""
+    assert found.outcome is not None and found.decided is not None
+    q = {"q": found.of_points["residuals"]["q"]}
+    return Verdicts(table, found.outcome, found.decided | q, found.rounds)
+
+
+def is_good(results: Mapping[str, int], outcomes: Mapping[str, int] | None) -> bool:
+    """Whether every pair is usable and, where pairs were cleaned, finished; by the
+    number of pairs of every result and outcome."""
+    pairs = sum(results.values())
+    usable = sum(results.get(name, 0) for name in USABLE)
+    finished = pairs if outcomes is None else outcomes.get("finished", 0)
+    return usable == finished == pairs

@@ -1,0 +1,259 @@
+"""Oriented pairs as every report and file reads them: columns in NumPy, with names,
+units and cameras. Elements, m_q and sigma0 are NaN where a result is not usable."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..adjustment import critical_values
+from ..assessment import Pattern, neighbours
+from ..batches.buckets import choose
+from ..batches.padding import sizes
+from ..batches.ragged import Ragged
+from ..geometry.elements import AbstractElements, RelativePose
+from ..geometry.linear import Linear, linearise
+from ..geometry.pairs import Camera, Coordinates, Pair, mask_unusable
+from ..tables.measured import CameraPairs, Table, take, to_list
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
+from .columns import (
+    RESULT_ADVICE,
+    RESULT_NAMES,
+    USABLE,
+    Column,
+    Units,
+    columns_of,
+    element_columns,
+    is_given,
+    is_usable,
+)
+
+MOST_POINTS = 200
+"""Points of a pair whose residuals are looked at together: of more, every second,
+third, ... one."""
+
+MOST_PAIRS = 100
+"""Pairs of a table whose residuals are tested for a pattern: of more, every second,
+third, ... one."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """One reported number of an orientation. `deviation` is None for what is given, not
+    adjusted; `half_width` of its interval is None where none was asked for."""
+
+    name: str
+    unit: str
+    value: float
+    deviation: float | None
+    half_width: float | None = None
+
+
+@dataclass(frozen=True)
+class Results:
+    """Oriented pairs: the columns of the pairs and, by table, of the points that
+    `table` holds, those kept. `confidence`: of the intervals that are asked for;
+    `patterns`: by the numbers of the pairs."""
+
+    table: Table
+    cameras: CameraPairs
+    system: type[AbstractElements]
+    units: Units
+    sigma_known: bool
+    of_pairs: dict[str, Any]
+    of_points: dict[str, dict[str, Any]]
+    confidence: float | None = None
+    patterns: dict[int, Pattern] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.table.names)
+
+    def __iter__(self) -> Iterator["One"]:
+        return (One(self, number) for number in range(len(self)))
+
+    @cached_property
+    def usable(self) -> Bool[np.ndarray, " pair"]:
+        """The pairs whose elements may be used."""
+        return is_usable(self.of_pairs["result"])
+
+    def written(self, name: str) -> tuple[Sequence[Column], dict[str, Any]]:
+        """The columns of a table, and their values by name."""
+        columns = columns_of(name, self.system)
+        if name == "elements":
+            own = {"pair": self.table.names, "points": self.table.lengths}
+            return columns, self.of_pairs | own
+        own = {
+            "pair": take(self.table.names, self.table.owners),
+            "point": self.table.points,
+        }
+        return columns, self.of_points[name] | own
+
+    @cached_property
+    def half_widths(self) -> dict[str, Float[np.ndarray, " pair"]]:
+        """Of the intervals of the adjusted elements; none where none are asked for.
+
+        Standard deviations times Student's t, or a normal quantile times sigma0 = 1
+        where sigma is given.
+        """
+        if self.confidence is None:
+            return {}
+        sigma0, freedom = self.of_pairs["sigma0"], self.of_pairs["degrees_of_freedom"]
+        if self.sigma_known:
+            quantile = float(critical_values.normal(1 - self.confidence))
+            there = sigma0 > 0
+            factor = np.where(there, quantile / np.where(there, sigma0, 1.0), np.nan)
+        else:
+            some, place = np.unique(freedom, return_inverse=True)
+            t = critical_values.half_width(self.confidence, jnp.asarray(some))
+            factor = np.asarray(t)[place]
+        deviations = [c for c in element_columns(self.system) if c.name[:3] == "sd_"]
+        return {c.name[3:]: self.of_pairs[c.name] * factor for c in deviations}
+
+    @cached_property
+    def pattern(self) -> Pattern | None:
+        """The test of all pairs together; None where nothing tells."""
+        found = list(self.patterns.values())
+        if not found:
+            return None
+        return neighbours.pool(jax.tree.map(lambda *a: np.stack(a), *found))
+
+
+@dataclass(frozen=True)
+class One:
+    """One pair of `Results`."""
+
+    results: Results
+    number: int
+
+    def value(self, column: str) -> Any:
+        """The value of a column of the pairs, as a number of Python."""
+        return self.results.of_pairs[column][self.number].item()
+
+    @property
+    def name(self) -> str:
+        """The name of the pair."""
+        return str(self.results.table.names[self.number])
+
+    @property
+    def count(self) -> int:
+        """The number of its points."""
+        return int(self.results.table.lengths[self.number])
+
+    @cached_property
+    def points(self) -> list[str]:
+        """The names of its points."""
+        return to_list(self.results.table.points[self._rows])
+
+    def of_points(self, table: str) -> dict[str, np.ndarray]:
+        """The columns of a table of its points."""
+        columns = self.results.of_points[table]
+        return {name: values[self._rows] for name, values in columns.items()}
+
+    @property
+    def _rows(self) -> slice:
+        begins = self.results.table.begins
+        return slice(int(begins[self.number]), int(begins[self.number + 1]))
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, Camera]:
+        """The left and the right camera."""
+        all_cameras = self.results.cameras
+        return (
+            all_cameras if isinstance(all_cameras, tuple) else all_cameras[self.number]
+        )
+
+    @cached_property
+    def result(self) -> str:
+        """The name of the result."""
+        return RESULT_NAMES[self.value("result")]
+
+    @property
+    def advice(self) -> str:
+        """The sentence of the result, empty for a plain success."""
+        return RESULT_ADVICE[self.result]
+
+    @property
+    def usable(self) -> bool:
+        """Whether the elements may be used."""
+        return self.result in USABLE
+
+    @cached_property
+    def elements(self) -> list[Element]:
+        """The elements that are reported, NaN where they are not usable."""
+        system, widths = self.results.system, self.results.half_widths
+        found = []
+        for column in element_columns(system):
+            name = column.name
+            if name.startswith("sd_"):
+                continue
+            given = is_given(name, system)
+            width = None if given or name not in widths else widths[name]
+            found.append(
+                Element(
+                    name=name,
+                    unit=self.results.units.of(column.kind),
+                    value=self.value(name),
+                    deviation=None if given else self.value(f"sd_{name}"),
+                    half_width=None if width is None else width[self.number].item(),
+                )
+            )
+        return found
+
+    @property
+    def correlations(self) -> dict[str, float]:
+        """Correlation of every two elements, "first/second"; empty where not usable."""
+        if not self.usable:
+            return {}
+        matrix = self.results.of_pairs["correlation"][self.number]
+        pairs = combinations(enumerate(self.results.system.names), 2)
+        return {f"{a}/{b}": float(matrix[i, j]) for (i, a), (j, b) in pairs}
+
+    @property
+    def pattern(self) -> Pattern | None:
+        """Whether residuals of neighbouring points agree; None where nothing tells."""
+        return self.results.patterns.get(self.number)
+
+
+def find_patterns(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, Pattern]:
+    """Whether residuals of neighbouring points agree, by the numbers of the pairs: of
+    at most MOST_PAIRS pairs with two degrees of freedom, MOST_POINTS points of each."""
+    count = len(pairs.lengths)
+    chosen = np.arange(0, count, max(1, -(-count // MOST_PAIRS)))
+    tells = is_usable(of_pairs["result"]) & (of_pairs["degrees_of_freedom"] >= 2)
+    chosen = chosen[tells[chosen]]
+    if not chosen.size:
+        return {}
+    rows = []
+    for begin, end in zip(pairs.begins[chosen], pairs.begins[chosen + 1], strict=True):
+        used = begin + np.flatnonzero(pairs.mask[begin:end])
+        rows.append(used[:: -(-len(used) // MOST_POINTS)])
+    thinned = choose(pairs, chosen, rows)
+    lengths = thinned.lengths
+    batch = thinned.pad_to(np.arange(len(chosen)), sizes(lengths, 1)[0])
+    read = Program(_linearise, {}, COMPILE_FAST)((batch, of_pairs["pose"][chosen]))
+    conditions = jax.tree.map(np.asarray, read)
+    return {
+        int(number): neighbours.of_linear(
+            *jax.tree.map(lambda a, k=k, n=n: a[k, :n], conditions)
+        )
+        for k, (number, n) in enumerate(zip(chosen, lengths, strict=True))
+    }
+
+
+def _linearise(
+    pairs_and_poses: tuple[Pair, Float[Array, "pair 7"]],
+) -> tuple[Linear, Coordinates]:
+    """The linearised conditions of pairs at their poses, and the coordinates."""
+
+    def one(pair: Pair, pose: Float[Array, "7"]) -> tuple[Linear, Coordinates]:
+        used = mask_unusable(pair)[0]
+        return linearise(used, RelativePose(*pose)), used.coordinates
+
+    return jax.vmap(one)(*pairs_and_poses)

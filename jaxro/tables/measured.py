@@ -1,0 +1,201 @@
+"""Measured points of many pairs as columns: what CSV and Parquet tables are read into.
+
+Columns of names are NumPy arrays of Python objects where the table is CSV text, Arrow
+arrays where it is Parquet; numbers are NumPy arrays.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..batches.ragged import Ragged
+from ..geometry.pairs import Camera, Pair
+from .fields import Columns
+
+COORDINATES = ("x_left", "y_left", "x_right", "y_right")
+
+COLUMNS = Columns(
+    ("point", *COORDINATES),
+    ("pair", "sigma"),
+    {"id": "point", "xl": "x_left", "yl": "y_left", "xr": "x_right", "yr": "y_right"},
+)
+NUMBERS = (*COORDINATES, "sigma")
+
+CameraPairs = tuple[Camera, Camera] | list[tuple[Camera, Camera]]
+"""(left, right) of all pairs, or of each."""
+
+
+@dataclass
+class Measurements:
+    """The measured points of one pair; `lines` are their lines in the file."""
+
+    name: str
+    points: list[str] = field(default_factory=list)
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+    lines: list[int] = field(default_factory=list)
+
+    @property
+    def coordinates(self) -> Float[np.ndarray, "4 point"]:
+        """x_left, y_left, x_right, y_right"""
+        return np.asarray(self.rows, np.float64)[:, :4].T
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " point"] | None:
+        """Standard deviations of the coordinates, where the table has them."""
+        rows = np.asarray(self.rows, np.float64)
+        return rows[:, 4] if rows.shape[1] == 5 else None
+
+
+@dataclass(frozen=True)
+class Table:
+    """The points of pairs one behind the other: pair k has the rows `begins[k]` to
+    `begins[k + 1]`.
+
+    `names` of the pairs; `points` and `numbers` of the rows, by the names of `NUMBERS`;
+    `lines` of the rows in CSV text; `warnings`: what a careful reader should be told.
+    """
+
+    file: str
+    names: Any
+    begins: Int[np.ndarray, " begins"]
+    points: Any
+    numbers: dict[str, Any]
+    lines: Int[np.ndarray, " row"] | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def has_sigma(self) -> bool:
+        """Whether the table has a column sigma."""
+        return "sigma" in self.numbers
+
+    @property
+    def lengths(self) -> Int[np.ndarray, " pair"]:
+        """Points of every pair."""
+        return np.diff(self.begins)
+
+    @cached_property
+    def owners(self) -> Int[np.ndarray, " row"]:
+        """The number of the pair of every row."""
+        return np.repeat(np.arange(len(self.begins) - 1), self.lengths)
+
+    def first_line(self, number: int) -> int | None:
+        """The line of the first point of a pair, in CSV text."""
+        return None if self.lines is None else int(self.lines[self.begins[number]])
+
+    @property
+    def pairs(self) -> list[Measurements]:
+        """The pairs of CSV text one by one."""
+        rows = list(zip(*(self.numbers[n].tolist() for n in self.numbers), strict=True))
+        points = self.points.tolist()
+        lines = [] if self.lines is None else self.lines.tolist()
+        spans = zip(self.begins[:-1].tolist(), self.begins[1:].tolist(), strict=True)
+        return [
+            Measurements(str(name), points[a:b], rows[a:b], lines[a:b])
+            for name, (a, b) in zip(self.names.tolist(), spans, strict=True)
+        ]
+
+    def choose(self, rows: Int[np.ndarray, " some"]) -> "Table":
+        """These rows of all pairs; a pair may have none left."""
+        counts = np.bincount(self.owners[rows], minlength=len(self.begins) - 1)
+        return replace(
+            self,
+            begins=np.concatenate([[0], np.cumsum(counts)]),
+            points=take(self.points, rows),
+            numbers={name: take(column, rows) for name, column in self.numbers.items()},
+            lines=None if self.lines is None else self.lines[rows],
+        )
+
+
+def take(column: Any, rows: np.ndarray) -> Any:
+    """These rows of a column of NumPy or Arrow."""
+    return column[rows] if isinstance(column, np.ndarray) else column.take(rows)
+
+
+def to_list(column: Any) -> list[Any]:
+    """The values of a column of NumPy or Arrow as Python objects."""
+    return column.tolist() if isinstance(column, np.ndarray) else column.to_pylist()
+
+
+def of_pairs(
+    pairs: Sequence[Measurements], file: str = "", warnings: Sequence[str] = ()
+) -> Table:
+    """Pairs one by one as columns."""
+    rows = np.array([row for pair in pairs for row in pair.rows], np.float64)
+    return Table(
+        file=file,
+        names=np.array([pair.name for pair in pairs], object),
+        begins=np.cumsum([0] + [len(pair.points) for pair in pairs]),
+        points=np.array([point for pair in pairs for point in pair.points], object),
+        numbers=dict(zip(NUMBERS, rows.T.copy(), strict=False)),
+        lines=np.array([line for pair in pairs for line in pair.lines], int),
+        warnings=tuple(warnings),
+    )
+
+
+def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) -> Ragged:
+    """The points in photo coordinates, by the arithmetic of `Camera.to_photo`.
+
+    `sigma`: standard deviation of all coordinates in the unit of the table, where the
+    table has no column of it; without both it is 1. Missing numbers are NaN.
+    """
+    count, pairs = len(table.points), len(table.begins) - 1
+
+    def constant(side: int, value: Any) -> Any:
+        """A number of the camera of one side, for all rows or for each."""
+        if isinstance(cameras, tuple):
+            return value(cameras[side])
+        each = np.array([value(both[side]) for both in cameras], np.float64)
+        return np.repeat(each, table.lengths)
+
+    photo = []
+    for side, (u, v) in enumerate((COORDINATES[:2], COORDINATES[2:])):
+        size = constant(side, lambda c: c.pixel_size)
+        sign = constant(side, lambda c: -1.0 if c.y_down else 1.0)
+        x0 = constant(side, lambda c: c.principal_point[0])
+        y0 = constant(side, lambda c: c.principal_point[1])
+        photo += [
+            (_floats(table.numbers[u]) - x0) * size,
+            (_floats(table.numbers[v]) - y0) * (sign * size),
+        ]
+    deviation = np.ones(count)
+    if table.has_sigma or sigma is not None:
+        given = (
+            _floats(table.numbers["sigma"])
+            if table.has_sigma
+            else np.full(count, sigma, float)
+        )
+        deviation = given * constant(0, lambda c: c.pixel_size)
+    each = [cameras] * pairs if isinstance(cameras, tuple) else cameras
+    focal_left, focal_right = np.array(
+        [(left.focal, right.focal) for left, right in each], np.float64
+    ).T.copy()
+    return Ragged(
+        begins=table.begins,
+        x_left=photo[0],
+        y_left=photo[1],
+        x_right=photo[2],
+        y_right=photo[3],
+        sigma=deviation,
+        mask=np.ones(count, bool),
+        focal_left=focal_left,
+        focal_right=focal_right,
+    )
+
+
+def one_pair(pairs: Ragged, number: int) -> Pair:
+    """A pair of `pairs`, not padded, as JAX arrays."""
+    members = np.array([number])
+    batch = pairs.pad_to(members, int(pairs.lengths[number]))
+    return jax.device_put(jax.tree.map(lambda a: a[0], batch))
+
+
+def _floats(column: Any) -> Float[np.ndarray, " row"]:
+    """The numbers of a column of NumPy or Arrow, NaN where one is missing."""
+    if not isinstance(column, np.ndarray):
+        column = column.cast("float64", safe=False).to_numpy()
+    return np.asarray(column, np.float64)
