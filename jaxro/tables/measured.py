@@ -189,9 +189,9 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
 
 def one_pair(pairs: Ragged, number: int) -> Pair:
     """A pair of `pairs`, not padded, as JAX arrays."""
-    members = np.array([number])
-    batch = pairs.pad_to(members, int(pairs.lengths[number]))
-    return jax.device_put(jax.tree.map(lambda a: a[0], batch))
+    rows = slice(int(pairs.begins[number]), int(pairs.begins[number + 1]))
+    of_points = [column[rows] for column in pairs[1:7]]
+    return Pair(*jax.device_put([*of_points, *(f[number] for f in pairs[7:])]))
 
 
 def _floats(column: Any) -> Float[np.ndarray, " row"]:
