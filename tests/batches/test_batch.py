@@ -19,7 +19,7 @@ from jaxro import DependentElements
 from jaxro.batches import batch
 from jaxro.geometry import mock_pairs
 from jaxro.geometry.elements import vertical
-from jaxro.orientation import starts
+from jaxro.orientation.problem import Problem
 from jaxro.xla import slabs, store
 from jaxro.xla.kernels import one_kernel, one_kernel_fusing_points
 from jaxro.xla.passes import pointwise
@@ -181,7 +181,11 @@ def test_only_what_is_selected_and_progress(pairs):
 
 @pytest.mark.parametrize("kernel", [one_kernel, one_kernel_fusing_points])
 def test_one_kernel_gives_what_many_give(pairs, kernel):
-    options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
+    options = {
+        "read": batch.Selected(lambda o: o),
+        "problem": Problem(),
+        "chunk": 32,
+    }
     few = jax.tree.map(lambda a: a[:96], pairs)
     programs = [
         Program(
@@ -221,7 +225,11 @@ def test_results_of_points_are_one_loop_each(pairs):
     oriented pair. If their calls were not marked any more, they would be inlined, read
     dozens of arrays, and be loops of single numbers."""
     host = jax.tree.map(np.asarray, pairs)
-    options = {"read": batch.Selected(lambda o: o), "start": starts.Auto(), "chunk": 32}
+    options = {
+        "read": batch.Selected(lambda o: o),
+        "problem": Problem(),
+        "chunk": 32,
+    }
     run = jax.jit(
         lambda data: one_kernel_fusing_points(batch._orient_slab_near)(data, **options),
         compiler_options=known_settings(RUN_FAST | UNSPLIT_LOOPS | NO_LIBRARY_SUMS),
