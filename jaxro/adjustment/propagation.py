@@ -153,8 +153,8 @@ def propagate_each(function: Callable, values: PyTree, deviations: PyTree) -> Py
 def propagate_adjusted(
     function: Callable, solved: Solution, sigma0: ArrayLike | None = None
 ) -> Propagated:
-    """`propagate` through a function of adjusted parameters (of an orientation: of its
-    elements) with their covariance sigma0² Q: with the estimated sigma0, or the one
+    """`propagate` through a function of adjusted parameters, such as the elements of an
+    orientation, with their covariance sigma0² Q: with the estimated sigma0, or the one
     given (1 where the given sigmas are true).
 
     For functions of the parameters alone. Model points depend on their coordinates as

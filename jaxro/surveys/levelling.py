@@ -169,7 +169,9 @@ def _solve(network: Network, traverses: _Traverses, fixed: Array) -> JointAdjust
     free = [jnp.minimum(node, count - 1) for node in (network.first, network.last)]
     measured = known_end(network.first), known_end(network.last), traverses.rise
     cofactor = (None, None, traverses.q)
-    term = Term(condition, measured, cofactor, [("height", node) for node in free])
+    term = Term(
+        condition, measured, cofactor, touches=[("height", node) for node in free]
+    )
     return adjust(term, {"height": jnp.broadcast_to(fixed[0], (count,))})
 
 

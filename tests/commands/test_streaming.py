@@ -19,6 +19,7 @@ from jaxro.commands import large
 from jaxro.commands.journal import JOURNAL, here
 from jaxro.commands.request import Options
 from jaxro.tables.fields import TableError
+from jaxro.xla import settings
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -36,6 +37,15 @@ def run(command, *arguments):
         result.exception
     )
     return result
+
+
+@pytest.fixture(scope="module", autouse=True)
+def settings_of_users():
+    """Other processes compile as users do: so does this one, to end in the same
+    bytes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(settings.COMPILE_FAST, "xla_backend_optimization_level", 1)
+        yield
 
 
 @pytest.fixture(scope="module")
