@@ -17,7 +17,7 @@ from ..xla.programs import Program, is_traced
 from ..xla.settings import COMPILE_FAST, COMPILE_FASTEST
 from . import starts
 from .describe import Description, describe
-from .problem import Problem
+from .problem import Problem, as_array
 from .result import Orientation
 from .solve import Solution, solve
 from .verdict import verdict
@@ -60,7 +60,7 @@ def orient(
         )
     problem = Problem(
         elements=elements,
-        base=base,
+        base=as_array(base),
         residual=residual,
         loss=loss,
         start=start,

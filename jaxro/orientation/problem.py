@@ -1,9 +1,8 @@
 """What is asked of the orientation of a pair: the options of `orient` as one value."""
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
 from jax import lax
@@ -17,12 +16,7 @@ from ..geometry.pairs import Pair
 from .starts import AbstractStart, Auto
 
 
-def _as_array(base: ArrayLike | None) -> Array | None:
-    """A given base as an array: an argument of a compiled program, not part of it."""
-    return None if base is None else jnp.asarray(base, float)
-
-
-class Problem(eqx.Module):
+class Problem(NamedTuple):
     """`elements`: the system of the result. `base`: its given length, if any.
     `residual`: what is minimised, a `Term` of the pair. `loss`: a robust loss in place
     of the sum of squares. `start`: where to begin, a start or known elements. `solver`:
@@ -31,7 +25,7 @@ class Problem(eqx.Module):
     """
 
     elements: type[AbstractElements] = RelativePose
-    base: Array | None = eqx.field(default=None, converter=_as_array)
+    base: Array | None = None
     residual: Callable[[Pair], Term] = coplanarity.rigorous
     loss: AbstractLoss | None = None
     start: AbstractStart | AbstractElements = Auto()
@@ -59,15 +53,20 @@ class Problem(eqx.Module):
     def starting(self, start: AbstractStart, max_steps: int | None = None) -> "Problem":
         """The same problem from another start, with other steps if given."""
         steps = self.max_steps if max_steps is None else max_steps
-        return replace(self, start=start, max_steps=steps)
+        return self._replace(start=start, max_steps=steps)
 
 
-def problem_of(options: dict) -> Problem:
+def problem_of(options: dict[str, Any]) -> Problem:
     """The problem of these options. Raises TypeError for what is none."""
-    names = [field.name for field in fields(Problem)]
     for name in options:
-        if name not in names:
+        if name not in Problem._fields:
             raise TypeError(
-                f"there is no option {name!r}: orient takes {', '.join(names)}"
+                f"there is no option {name!r}: orient takes {', '.join(Problem._fields)}"
             )
-    return Problem(**options)
+    given: dict[str, Any] = options | {"base": as_array(options.get("base"))}
+    return Problem(**given)
+
+
+def as_array(base: ArrayLike | None) -> Array | None:
+    """A given base as an array: an argument of a compiled program, not part of it."""
+    return None if base is None else jnp.asarray(base, float)
