@@ -23,11 +23,12 @@ def machine() -> str:
 
 
 def main() -> int:
-    from . import colmap, engine, photos, reading, rejection, scale
+    from . import colmap, engine, first, photos, reading, rejection, scale
     from .common import QUICK, Size
 
     suites = (
         engine.SUITES
+        | first.SUITES
         | rejection.SUITES
         | reading.SUITES
         | scale.SUITES

@@ -19,7 +19,7 @@ from ..adjustment import critical_values
 from ..adjustment.normal_equations import solve
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
-from ..geometry.mock_pairs import plant
+from ..geometry.mock_pairs import draw_points, plant
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.results import is_usable
 from ..rejection import AbstractProcedure, Rejection
@@ -158,9 +158,7 @@ def _repeat(
     """A pair with normal errors and so many wrong points, and which they are."""
     points = exact.mask.shape
     which, noise, size = jax.random.split(key, 3)
-    chance = jnp.where(exact.mask, jax.random.uniform(which, points), 2.0)
-    rank = jnp.argsort(jnp.argsort(chance))
-    wrong = (rank < number) & exact.mask
+    wrong = draw_points(which, exact.mask, number)
     sigma = (unit * exact.sigma)[None, :]
     errors = sigma * jax.random.normal(noise, (4, *points))
     partners = jnp.where(wrong[None, :], _wrong_partners(size, most, points), 0.0)

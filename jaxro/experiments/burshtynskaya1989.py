@@ -28,7 +28,7 @@ import numpy as np
 
 from ..batches.batch import clean_batch
 from ..geometry import mock_pairs
-from ..geometry.mock_pairs import noisy, plant
+from ..geometry.mock_pairs import draw_points, noisy, plant
 from ..geometry.pairs import Pair
 from ..rejection import AbstractProcedure, Rejection, TwoStage
 from ..xla.programs import Program
@@ -295,8 +295,7 @@ def _simulate(plan: tuple):
 
     def vary(key, errors, limits):
         noise, place, size, sign = jax.random.split(key, 4)
-        chance = jax.random.uniform(place, points, float)
-        wrong = jnp.argsort(jnp.argsort(chance)) < errors
+        wrong = draw_points(place, exact.mask, errors)
         least, most = limits
         sizes = jax.random.uniform(size, points, float, least, most) * SIGMA
         signed = jnp.where(jax.random.bernoulli(sign, shape=points), sizes, -sizes)

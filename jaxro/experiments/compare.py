@@ -24,7 +24,7 @@ import numpy as np
 
 from ..batches.batch import clean_batch
 from ..geometry.elements import RelativePose
-from ..geometry.mock_pairs import noisy, plant
+from ..geometry.mock_pairs import draw_points, noisy, plant
 from ..geometry.pairs import Pair
 from ..orientation.orient import orient
 from ..orientation.results import is_usable
@@ -215,9 +215,7 @@ def _simulate(plan: tuple):
 
     def measure(key):
         noise, place, sign = jax.random.split(key, 3)
-        chance = jax.random.uniform(place, points, float)
-        rank = jnp.argsort(jnp.argsort(jnp.where(exact.mask, chance, 2.0)))
-        wrong = (rank < errors) & exact.mask
+        wrong = draw_points(place, exact.mask, errors)
         side = jnp.where(jax.random.bernoulli(sign, shape=points), 1.0, -1.0)
         measured = noisy(exact, noise, exact.sigma[None, :])
         error = jnp.where(wrong, side * size * exact.sigma, 0.0)

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from . import elements as el, rotations as rot
 from .pairs import Pair, pair
@@ -173,6 +173,15 @@ def noisy(one: Pair, key: PRNGKeyArray, sigma: ArrayLike) -> Pair:
     return plant(
         one, x_left=errors[0], y_left=errors[1], x_right=errors[2], y_right=errors[3]
     )
+
+
+def draw_points(
+    key: PRNGKeyArray, mask: Bool[Array, "point"], number: ArrayLike
+) -> Bool[Array, "point"]:
+    """So many points of the mask, each set of them equally likely."""
+    chance = jnp.where(mask, jax.random.uniform(key, mask.shape, float), 2.0)
+    rank = jnp.argsort(jnp.argsort(chance))
+    return mask & (rank < number)
 
 
 CONE = math.radians(20.0)

@@ -14,6 +14,10 @@ from . import starts
 from .problem import Problem
 from .starts import StartingPose
 
+TOLERANCE = 1e-12
+"""Steps (rad) below it end the adjustment: a pair alone and in a batch, begun here or
+there, ends at the same numbers."""
+
 LONGEST = 0.5
 """Longest component of a step (rad): beyond it the linearisation means nothing."""
 
@@ -28,12 +32,7 @@ class Solution(NamedTuple):
 def solve(pair: Pair, problem: Problem) -> Solution:
     """The solution of a pair whose masked points are zero."""
     start = _begin(pair, problem.start)
-    # rounding decides where the general start ends, in a batch elsewhere than alone:
-    # the solution has to forget it. An `Auto` comes here under a caller's jit, for whom
-    # a tenth of the time is worth more than a step below 1e-10.
-    tolerances = {starts.General: 1e-14, starts.Auto: 1e-10}
-    tolerance = tolerances.get(type(problem.start), 1e-12)
-    own = GaussNewton(tolerance, tolerance, max_step=LONGEST)
+    own = GaussNewton(TOLERANCE, TOLERANCE, max_step=LONGEST)
     adjustment = adjust(
         problem.residual(pair),
         start.pose,

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from ..adjustment import critical_values
 from ..adjustment.normal_equations import accumulate, cholesky, substitute
 from ..geometry.elements import AbstractElements
-from ..geometry.mock_pairs import noisy, plant
+from ..geometry.mock_pairs import draw_points, noisy, plant
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import orient
 from ..xla.kernels import computed_once
@@ -231,9 +231,7 @@ def calibrate(
 
     def largest_v(key, omitted):
         noise, choice = jax.random.split(key)
-        chance = jax.random.uniform(choice, pair.mask.shape, float)
-        rank = jnp.argsort(jnp.argsort(jnp.where(pair.mask, chance, 2.0)))
-        mask = pair.mask & (rank >= omitted)
+        mask = pair.mask & ~draw_points(choice, pair.mask, omitted)
         measured = noisy(exact, noise, SMALL * pair.focal_left)
         pose = adjust_parallaxes(measured, mask, solved.pose).pose
         return jnp.max(procedure.statistic(measured, mask, pose)[0])

@@ -196,7 +196,7 @@ class Thorough(AbstractStage):
         relative = 1 / jnp.sqrt(2 * jnp.maximum(redundancy, 0.5))
         upper = noise.sigma * (1 + evidence.DEVIATIONS * relative)
         too_large = (upper < APART * scale) & (redundancy >= SURE)
-        agreed = count(squares(own, pose) <= self.search.limit**2)
+        agreed = count(points_within(own, pose, self.search.limit))
         of_most = redundancy >= MAJORITY * agreed
         taken = noise.known & of_most & (too_large | (not self.known))
         return jnp.where(taken, jnp.clip(noise.sigma, 1 / MOST, MOST), scale)
