@@ -26,7 +26,6 @@ draws belong to the tested points in their order, so that masked points change n
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -65,7 +64,7 @@ NORMAL, EXPONENTIAL = _tables()
 def largest_w(level: ArrayLike, normalised: Normalised) -> Float[Array, ""]:
     """The value that the largest |w| of an errorless pair exceeds with probability
     `level`; sigma0 is known."""
-    value = lambda number: critical.normal(jnp.asarray(level, float) / number)
+    value = lambda number: critical.normal(level / number)
     beyond = critical.by_count(
         lambda n: critical.normal(critical.sidak(level, n)),
         normalised.w.shape[0],
@@ -79,15 +78,13 @@ def largest_tau(level: ArrayLike, normalised: Normalised) -> Float[Array, ""]:
     `level`; sigma0 is estimated. Infinite with one degree of freedom, where every |tau|
     is 1."""
     most, points = normalised.w.shape[0], normalised.freedom + 5
-    freedom = lambda n: jnp.maximum(n - 5, 1.0)
+    freedom = lambda n: np.maximum(n - 5, 1.0)
     beyond = critical.by_count(
         lambda n: critical.tau(critical.sidak(level, n), freedom(n)), most, points
     )
-    with jax.ensure_compile_time_eval():
-        number = jnp.asarray(MOST ** (np.arange(KNOTS) / (KNOTS - 1)))
-        n = jnp.arange(min(most, MOST) + 1.0)
-        levels = jnp.asarray(level, float) / number[None, :]
-        table = critical.tau(levels, freedom(n)[:, None])
+    number = MOST ** (np.arange(KNOTS) / (KNOTS - 1))
+    n = np.arange(min(most, MOST) + 1.0)
+    table = critical.tau(level / number[None, :], freedom(n)[:, None])
     own = jnp.arange(n.size) == points.astype(int)
     own = own & (n > 6)
     row = jnp.sum(jnp.where(own[:, None], table, 0.0), axis=0)

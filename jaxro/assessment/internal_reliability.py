@@ -9,7 +9,6 @@ delta0 sigma0 sqrt(D / r) in g. `reliability` has all formulas together.
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -104,13 +103,12 @@ def tests(
             raise ValueError(
                 f"{name} is a probability, between 0 and 1, got {probability}"
             )
-    with jax.ensure_compile_time_eval():
-        n = jnp.asarray(critical.counts(most))
-        alone = critical.sidak(level, n) if familywise else jnp.full_like(n, level)
-        if known:
-            delta, limit = critical.delta_normal(alone, power), critical.normal(alone)
-        else:
-            freedom = jnp.maximum(n - 5, 2.0)
-            delta = critical.delta_student(alone, power, freedom - 1)
-            limit = critical.tau(alone, freedom)
-        return np.asarray(delta), np.asarray(limit), np.asarray(alone)
+    n = critical.counts(most)
+    alone = critical.sidak(level, n) if familywise else np.full_like(n, level)
+    if known:
+        delta, limit = critical.delta_normal(alone, power), critical.normal(alone)
+    else:
+        freedom = np.maximum(n - 5, 2.0)
+        delta = critical.delta_student(alone, power, freedom - 1)
+        limit = critical.tau(alone, freedom)
+    return delta, limit, alone

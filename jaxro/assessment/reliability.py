@@ -23,7 +23,7 @@ of first order, at the measured coordinates.
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import gammainc, gammaincc, ndtr
+from jax.scipy.special import ndtr
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..adjustment import critical_values as critical
@@ -181,16 +181,13 @@ class Reliability(eqx.Module):
         there = self.known & (self.degrees_of_freedom > 0)
         f = jnp.where(there, self._freedom, 1.0)
         ratio = jnp.where(there, self.estimated / self.sigma0, 1.0)
-        half = f * ratio**2 / 2
-        below, above = gammainc(f / 2, half), gammaincc(f / 2, half)
-        p = jnp.where(below < above, 2 * below, 2 * above)
-        return jnp.where(there, p, 1.0)
+        return jnp.where(there, critical.global_p(f * ratio**2, f), 1.0)
 
     def b_level(self) -> PerPair:
         """The level at which the one-sided global test has the power of the tests of
         points (Baarda's B-method)."""
         freedom = jnp.where(self._freedom > 0, self._freedom, 1.0)
-        return critical.b_method(self.level, self.power, freedom)
+        return jnp.asarray(critical.b_method(self.level, self.power, freedom))
 
     def significance_p(self) -> PerElement:
         """The probability that an element whose true value is zero appears as large as

@@ -20,6 +20,7 @@ the others are little correlated with it, or where its error is large.
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment import critical_values
@@ -53,7 +54,7 @@ def explanations(
     rho, w = normalised.row(point), normalised.w
     own = jnp.arange(w.shape[0]) == point
     w_own = jnp.sum(jnp.where(own, w, 0.0))
-    limit = critical_values.normal(doubt)
+    limit = jnp.asarray(critical_values.normal(doubt))
     if estimated:
         limit = _limit_of_tau(normalised, doubt)
     spread = jnp.sqrt(jnp.maximum(1 - rho**2, UNTESTABLE**2))
@@ -67,7 +68,7 @@ def _limit_of_tau(normalised: Normalised, doubt: float) -> Values:
     with one degree of freedom left, where there is no test and all points are named."""
     w, freedom = normalised.w, normalised.freedom - 1
     points = freedom + 6
-    value = lambda n: critical_values.tau(doubt, jnp.maximum(n - 6, 1.0))
+    value = lambda n: critical_values.tau(doubt, np.maximum(n - 6, 1.0))
     tau = critical_values.by_count(value, w.shape[0], points)
     rest = jnp.maximum(normalised.squares - w**2, 0.0)
     sigma0 = jnp.sqrt(rest / jnp.maximum(freedom, 1.0))
@@ -101,7 +102,7 @@ def undecided_points(
     outside = pair.mask & ~use
     candidates = outside if rejected is None else rejected & outside
     exchange = _compare(linearise(pair, pose), use)
-    limit = critical_values.normal(doubt)
+    limit = jnp.asarray(critical_values.normal(doubt))
 
     def examine(state: tuple[Use, Use]) -> tuple[Use, Use]:
         left, named = state

@@ -41,17 +41,15 @@ CHUNK_POINTS = 16384
 """Points per chunk: a working set of a few hundred kB, which stays in the cache of one
 core."""
 
-SUBSETS = 256
-"""Random subsets that are solved together."""
-
 ALONE = 1 << 15
 """Points of a batch that are oriented from the vertical before other threads have
 begun."""
 
-MOMENT, SOON = 1 << 9, 1 << 17
-"""Points of a batch up to which a program runs for milliseconds and, that of a general
-start or a procedure, seconds: these compile in 11 and 12 instead of 18 seconds and run
-a fourteenth slower."""
+MOMENT, SHORT, SOON = 1 << 9, 1 << 13, 1 << 17
+"""Points of a batch up to which a program runs for an instant, for milliseconds and,
+that of a general start or a procedure, for seconds. The shorter it runs, the sooner it
+has to be compiled: up to SHORT pairs go through one by one, without `vmap`, which
+doubles what there is to compile."""
 
 FEW = 32
 """Points up to which wider vectors gain (3 to 10 %) in what is not one kernel; with
@@ -243,10 +241,9 @@ def clean_slabs(
     """What is selected of every pair's rejection, in NumPy, and for which pairs the
     procedure was in doubt."""
     chunk = _chunk(pairs, split.chunk)
-    # a search has many subsets of each pair in work, and goes on until the last pair of
-    # its chunk is served
-    if split.chunk is None:
-        chunk = min(chunk, _searched_together(procedure))
+    # a search has work enough in the subsets of one pair, which then waits for no other
+    if split.chunk is None and _searches(procedure):
+        chunk = 1
     program = Program(
         _clean_slab,
         {"procedure": procedure, "select": select, "chunk": chunk},
@@ -279,16 +276,10 @@ def map_batch(
     return _finish(spread(host, program, split, chunk, progress or silent))
 
 
-def _searched_together(procedure: AbstractProcedure) -> int:
-    """Pairs per chunk at most, by the subsets of each pair that are in work."""
-    kinds = (AbstractHypotheses, Search)
-    is_kind = lambda part: isinstance(part, kinds)
-    blocks = [
-        part.block
-        for part in jax.tree.leaves(procedure, is_leaf=is_kind)
-        if is_kind(part)
-    ]
-    return min([max(SUBSETS // block, 1) for block in blocks], default=1 << 16)
+def _searches(procedure: AbstractProcedure) -> bool:
+    """Whether the procedure searches among random subsets of the points."""
+    is_search = lambda part: isinstance(part, AbstractHypotheses | Search)
+    return any(map(is_search, jax.tree.leaves(procedure, is_leaf=is_search)))
 
 
 def _chunk(pairs: Any, chunk: int | None) -> int:
@@ -300,6 +291,8 @@ def _chunk(pairs: Any, chunk: int | None) -> int:
         )
     if chunk is not None:
         return operator.index(chunk)
+    if pairs.x_left.size <= SHORT:
+        return 1
     fitting = max(CHUNK_POINTS // max(pairs.x_left.shape[1], 1), 4)
     return min(128, 1 << fitting.bit_length() - 1)
 
@@ -310,10 +303,10 @@ def _settings(pairs: Any, lasting: dict[str, Any] | None = None) -> dict[str, An
     points = pairs.x_left.size
     if points <= MOMENT:
         return COMPILE_FASTEST
+    if points <= SHORT or (lasting is None and points <= SOON):
+        return COMPILE_FAST
     if lasting is not None:
         return lasting
-    if points <= SOON:
-        return COMPILE_FAST
     return RUN_FAST if pairs.x_left.shape[1] > FEW else RUN_FAST | WIDE_VECTORS
 
 

@@ -115,7 +115,7 @@ class Orientation(eqx.Module):
             return jnp.broadcast_to(known, self.sigma0.shape)
         return self._quantile(lambda f: critical_values.radius(confidence, 5, f))
 
-    def _quantile(self, of: Callable[[Array], Array]) -> Float[Array, "*pairs"]:
+    def _quantile(self, of: Callable) -> Float[Array, "*pairs"]:
         """A quantile by the degrees of freedom of every pair."""
         most = max(self.residuals.shape[-1] - 5, 0)
         table = lambda freedom: critical_values.by_count(of, most, freedom)

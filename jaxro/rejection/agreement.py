@@ -12,6 +12,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..adjustment import critical_values
@@ -45,7 +46,7 @@ def familywise_limit(level: float, pair: Pair) -> Float[Array, ""]:
     probability `level`, as if all its tests were independent: the normal value of level
     / n (Bonferroni)."""
     return critical_values.by_count(
-        lambda n: critical_values.normal(level / jnp.maximum(n, 1.0)),
+        lambda n: critical_values.normal(level / np.maximum(n, 1.0)),
         pair.x_left.shape[0],
         count(pair.mask),
     )

@@ -92,7 +92,7 @@ class AllSubsets(AbstractProcedure):
     def _limits(self, pair: Pair, numbers: int) -> Float[Array, "number"]:
         """The critical values of Σ (r / sigma)² after 0, 1, ... omissions."""
         value = lambda n: critical_values.chi_squared(
-            self.level, jnp.maximum(n - 5, 1.0)
+            self.level, np.maximum(n - 5, 1.0)
         )
         points, used = pair.x_left.shape[0], count(pair.mask)
         limits = [

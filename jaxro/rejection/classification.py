@@ -20,6 +20,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -114,7 +115,7 @@ def verdict(rejection: Rejection) -> Verdict:
 def classify(pair: Pair, verdict: Verdict) -> Found:
     """The kind of a pair, from the verdict of the engine on it."""
     pair = mask_unusable(pair)[0]
-    each = lambda n: critical_values.normal(ENGINE.level / jnp.maximum(n, 1.0))
+    each = lambda n: critical_values.normal(ENGINE.level / np.maximum(n, 1.0))
     limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
     plane = in_plane(pair, verdict.pose, verdict.mask, limit)
     pose, use, turned = without_base(pair, plane.pose, plane.use, verdict.result, limit)

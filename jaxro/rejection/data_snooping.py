@@ -1,6 +1,6 @@
 """Data snooping: the largest normalised residual goes (Baarda 1968, Pope 1976)."""
 
-import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -90,9 +90,9 @@ class DataSnooping(AbstractProcedure):
             self._point_limit, found.w.shape[0], found.freedom + 5
         )
 
-    def _point_limit(self, n: Float[Array, "..."]) -> Float[Array, "..."]:
+    def _point_limit(self, n: np.ndarray) -> critical_values.Scalar:
         """The critical value of one of n points, tested alone."""
         level = self.level + 0 * n
         if self.estimated:
-            return critical_values.tau(level, jnp.maximum(n - 5, 1.0))
+            return critical_values.tau(level, np.maximum(n - 5, 1.0))
         return critical_values.normal(level)

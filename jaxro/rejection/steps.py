@@ -46,8 +46,9 @@ def normal_equations(linear: Linear, weight: Values) -> tuple:
     return n, h
 
 
-def inner(one: Sequence[Values], other: Sequence[Values]) -> Values:
-    """The scalar product of two vectors, of every point."""
+def inner(one: Sequence[Values], other: Sequence[Float[Array, "..."]]) -> Values:
+    """The scalar product of two vectors, of every point; `other` may be one vector for
+    all points."""
     product = one[0] * other[0]
     for a, b in zip(one[1:], other[1:], strict=True):
         product = product + a * b

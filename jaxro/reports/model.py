@@ -8,7 +8,6 @@ from itertools import combinations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -111,7 +110,7 @@ class Results:
             factor = np.where(there, quantile / np.where(there, sigma0, 1.0), np.nan)
         else:
             some, place = np.unique(freedom, return_inverse=True)
-            t = critical_values.half_width(self.confidence, jnp.asarray(some))
+            t = critical_values.half_width(self.confidence, some)
             factor = np.asarray(t)[place]
         deviations = [c for c in element_columns(self.system) if c.name[:3] == "sd_"]
         return {c.name[3:]: self.of_pairs[c.name] * factor for c in deviations}

@@ -1,12 +1,11 @@
 """How far the measurements of a pair check one another, on the terminal: a table and
 sentences."""
 
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import gammainc, gammaincc
 from rich.console import Console
 from rich.markup import escape
 
+from ..adjustment import critical_values
 from ..assessment import Pattern
 from ..assessment.reliability import BOUNDS
 from .columns import Units
@@ -143,9 +142,7 @@ def _doubt_sigma(one: One) -> list[str]:
     ratio, freedom = one.value("sigma0"), one.value("degrees_of_freedom")
     if not one.results.sigma_known:
         return []
-    half = jnp.asarray(freedom * ratio**2 / 2)
-    below, above = (tail(freedom / 2, half) for tail in (gammainc, gammaincc))
-    chance = float(2 * jnp.minimum(below, above))
+    chance = float(critical_values.global_p(freedom * ratio**2, freedom))
     if chance >= DOUBTFUL:
         return []
     if ratio > 1:

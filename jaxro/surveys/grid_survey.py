@@ -245,7 +245,7 @@ def _solve(survey: Survey, level: float, power: float) -> Surveyed:
         shares=shares,
         w=w,
         detectable=detectable,
-        limit=critical.normal(level),
+        limit=jnp.asarray(critical.normal(level)),
         leg_deviations=leg_deviations,
         adjusted=adjusted,
     )

@@ -124,7 +124,7 @@ def adjust_heights(
         leg_redundancy=network.as_given(share * r[network.traverse]),
         sigma0=_sigma0(misclosure, traverses.q, solved.degrees_of_freedom),
         degrees_of_freedom=solved.degrees_of_freedom,
-        limit=critical.normal(level),
+        limit=jnp.asarray(critical.normal(level)),
         result=solved.result,
     )
 

@@ -6,7 +6,7 @@ and `if_needed` is `jnp.where`.
 """
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, wraps
 from typing import Any
 
 import equinox as eqx
@@ -29,6 +29,7 @@ def one_kernel(function: Callable) -> Callable:
     next at run time, which costs more than the work of a small pair.
     """
 
+    @wraps(function)
     def within(data: PyTree, **options: Any) -> PyTree:
         with_options = lambda data: function(data, **options)
         if is_plain(Trick.ONE_KERNEL):
@@ -43,6 +44,7 @@ def one_kernel_fusing_points(function: Callable) -> Callable:
     """`one_kernel`, in which everything that `passes.pointwise` computes of a point is
     one loop."""
 
+    @wraps(function)
     def within(data: PyTree, **options: Any) -> PyTree:
         with _fusing_points(True):
             return one_kernel(function)(data, **options)
@@ -55,6 +57,7 @@ def kernels_of_parts(function: Callable) -> Callable:
     """The function with each `kernel_part` of it as one compiled function of the
     processor; compiles sooner than `one_kernel`."""
 
+    @wraps(function)
     def within(data: PyTree, **options: Any) -> PyTree:
         with _making_kernels(True):
             return function(data, **options)

@@ -8,7 +8,7 @@ off by `settings.plain` is part of every key.
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, wraps
 from typing import Any
 
 import equinox as eqx
@@ -137,6 +137,7 @@ def jit_in_this_thread(
     if kept or threaded:
         return jax.jit(function, compiler_options=settings)
 
+    @wraps(function)
     def within(*arguments):
         numbers = [
             a
@@ -155,6 +156,7 @@ def jit_in_this_thread(
 
 
 def _flat(function: Callable, static: _Key) -> Callable:
+    @wraps(function)
     def flat(data: PyTree, arrays: dict[str, Any]) -> PyTree:
         with pause_collection():
             return function(data, **eqx.combine(arrays, static.tree))
