@@ -34,7 +34,7 @@ from ..geometry.pairs import Coordinates, Pair, mask_unusable
 from ..orientation.orient import Orientation
 from ..xla.kernels import computed_once
 from ..xla.programs import Program, is_traced
-from ..xla.settings import COMPILE_FAST
+from ..xla.settings import settings_for
 from .external_reliability import Effects, effects
 from .internal_reliability import Checks, check, normalised_residuals, tests
 
@@ -245,7 +245,9 @@ def assess(
     }
     if is_traced((pair, orientation, sigma0)):
         return _assess((pair, orientation), **options)
-    return Program(_assess, options, COMPILE_FAST)((pair, orientation))
+    return Program(_assess, options, settings_for(pair.x_left.size))(
+        (pair, orientation)
+    )
 
 
 def _assess(

@@ -29,11 +29,12 @@ from ..rejection.search import Search
 from ..xla.kernels import one_kernel, one_kernel_fusing_points
 from ..xla.programs import Program
 from ..xla.settings import (
-    COMPILE_FAST,
-    COMPILE_FASTEST,
+    FEW,
+    MOMENT,
     RUN_FAST,
     UNSPLIT_LOOPS,
     WIDE_VECTORS,
+    settings_for,
 )
 from ..xla.slabs import Progress, Split, map_chunks, silent, spread
 
@@ -45,15 +46,11 @@ ALONE = 1 << 15
 """Points of a batch that are oriented from the vertical before other threads have
 begun."""
 
-MOMENT, SHORT, SOON = 1 << 9, 1 << 13, 1 << 17
-"""Points of a batch up to which a program runs for an instant, for milliseconds and,
-that of a general start or a procedure, for seconds. The shorter it runs, the sooner it
+SHORT, SOON = 1 << 13, 1 << 17
+"""Points of a batch up to which a program runs for milliseconds and, that of a general
+start or a procedure, for seconds. The shorter it runs, the sooner it
 has to be compiled: up to SHORT pairs go through one by one, without `vmap`, which
 doubles what there is to compile."""
-
-FEW = 32
-"""Points up to which wider vectors gain (3 to 10 %) in what is not one kernel; with
-more they lose."""
 
 
 def _everything(result: Any) -> Any:
@@ -301,12 +298,11 @@ def _settings(pairs: Any, lasting: dict[str, Any] | None = None) -> dict[str, An
     """How to compile for so many pairs: the longer they take, the more is gained by
     what takes long to compile."""
     points = pairs.x_left.size
-    if points <= MOMENT:
-        return COMPILE_FASTEST
     if points <= SHORT or (lasting is None and points <= SOON):
-        return COMPILE_FAST
+        return settings_for(points, MOMENT)
     if lasting is not None:
         return lasting
+    # of more points wider vectors lose in what is not one kernel
     return RUN_FAST if pairs.x_left.shape[1] > FEW else RUN_FAST | WIDE_VECTORS
 
 

@@ -34,7 +34,7 @@ from ..reports.verdicts import (
 )
 from ..tables.measured import CameraPairs, Table, one_pair
 from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.settings import MOMENT, settings_for
 
 RESIDUALS = {"rigorous": coplanarity.rigorous, "parallax": coplanarity.parallax}
 """What is minimised, by the names of the command line."""
@@ -117,9 +117,8 @@ def _orient(
     if plan is None:
         pair = one_pair(pairs, 0)
         orientation = orient(pair, **task.keywords)
-        read = Program(_read, {"reader": task.reader}, COMPILE_FAST)(
-            (pair, orientation)
-        )
+        settings = settings_for(pair.x_left.size, MOMENT)
+        read = Program(_read, {"reader": task.reader}, settings)((pair, orientation))
         of_pair, of_points = jax.tree.map(np.asarray, read)
         of_pairs = jax.tree.map(lambda a: a[None], of_pair)
         told(1)
@@ -202,7 +201,8 @@ def _assess(
     if plan is not None:
         return map_ragged(task.assessor, pairs, batch_of, plan, threads)
     one = jax.tree.map(lambda a: a[0], batch_of(np.zeros(1, int), len(pairs.x_left)))
-    found = Program(_assess_one, {"assessor": task.assessor}, COMPILE_FAST)(one)
+    settings = settings_for(one.x_left.size, MOMENT)
+    found = Program(_assess_one, {"assessor": task.assessor}, settings)(one)
     return jax.tree.map(np.asarray, found)
 
 

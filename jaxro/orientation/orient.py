@@ -14,17 +14,13 @@ from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.pairs import Pair, double, mask_unusable
 from ..xla.kernels import kernels_of_parts, one_kernel
 from ..xla.programs import Program, is_traced
-from ..xla.settings import COMPILE_FAST, COMPILE_FASTEST
+from ..xla.settings import FEW, settings_for
 from . import starts
 from .describe import Description, describe
 from .problem import Problem, as_array
 from .result import Orientation
 from .solve import Solution, solve
 from .verdict import verdict
-
-FEW = 32
-"""Points up to which a program that compiles quickly, without a first step of its own,
-outweighs a quicker one."""
 
 NEAR_STEPS = 10
 """Steps allowed from the vertical without a loss: near-vertical photos take four or
@@ -82,7 +78,7 @@ def orient(
 
 def _run(function: Callable, pair: Pair, problem: Problem, kernel: Callable) -> Any:
     """function(pair, problem) by a program that compiles quickly."""
-    settings = COMPILE_FASTEST if pair.x_left.size <= FEW else COMPILE_FAST
+    settings = settings_for(pair.x_left.size)
     # the compiler makes no kernel of a solver of the user's, and none of no points
     as_kernel = problem.solver is None and pair.x_left.size > 0
     options = {"problem": problem}

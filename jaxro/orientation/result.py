@@ -14,7 +14,7 @@ from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.pairs import Coordinates, Pair, mask_unusable
 from ..xla.programs import Program, is_traced
-from ..xla.settings import COMPILE_FAST, RUN_FAST
+from ..xla.settings import RUN_FAST, settings_for
 from .results import RESULTS, is_usable
 
 
@@ -129,7 +129,8 @@ class Orientation(eqx.Module):
         data = self.pose, pair
         if is_traced(data):
             return _corrections_of(data)
-        settings = RUN_FAST if jnp.ndim(self.sigma0) else COMPILE_FAST
+        many = jnp.ndim(self.sigma0)
+        settings = RUN_FAST if many else settings_for(pair.x_left.size)
         return Program(_corrections_of, {}, settings)(data)
 
     def check(self) -> "Orientation":

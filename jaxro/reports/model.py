@@ -21,7 +21,7 @@ from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Camera, Coordinates, Pair, mask_unusable
 from ..tables.measured import CameraPairs, Table, take, to_list
 from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.settings import MOMENT, settings_for
 from .columns import (
     RESULT_ADVICE,
     RESULT_NAMES,
@@ -236,7 +236,8 @@ def find_patterns(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, Pattern]
     thinned = choose(pairs, chosen, rows)
     lengths = thinned.lengths
     batch = thinned.pad_to(np.arange(len(chosen)), sizes(lengths, 1)[0])
-    read = Program(_linearise, {}, COMPILE_FAST)((batch, of_pairs["pose"][chosen]))
+    settings = settings_for(batch.x_left.size, MOMENT)
+    read = Program(_linearise, {}, settings)((batch, of_pairs["pose"][chosen]))
     conditions = jax.tree.map(np.asarray, read)
     return {
         int(number): neighbours.of_linear(

@@ -91,6 +91,17 @@ lower level of optimisation."""
 COMPILE_FASTEST = {**COMPILE_FAST, "xla_backend_optimization_level": 0}
 """For what runs once or for an instant: no optimisation of the machine code."""
 
+FEW, MOMENT = 32, 1 << 9
+"""Points up to which a pair of a user's call, or all pairs of a call that is made once,
+are worked on in no time, whatever the compiler does."""
+
+
+def settings_for(points: int, most: int = FEW) -> dict[str, Any]:
+    """The settings of a program of one pair with so many points; `most` as FEW or
+    MOMENT."""
+    return COMPILE_FASTEST if points <= most else COMPILE_FAST
+
+
 UNSPLIT_LOOPS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
 """Loops are not split over threads of the compiler's own: for pairs that are spread
 over threads as they are. `one_kernel_fusing_points` needs it, as a loop of several
