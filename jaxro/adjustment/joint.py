@@ -133,8 +133,15 @@ def adjust_jointly(
 ) -> JointAdjustment:
     """What `adjust` does for several terms."""
     families = {
-        name: jax.tree.map(jnp.asarray, family) for name, family in start.items()
+        name: jax.tree.map(lambda a: jnp.asarray(a, float), family)
+        for name, family in start.items()
     }
+    for name, family in families.items():
+        if any(jnp.ndim(a) == 0 for a in jax.tree.leaves(family)):
+            raise ValueError(
+                f"adjust: the start of family {name!r} has a single number; each number "
+                "of a block is an array over all blocks of the family"
+            )
     # the optimum does not depend on where it is sought
     families = jax.lax.stop_gradient(families)
     layout = elimination.layout(families, terms, eliminate)

@@ -70,7 +70,9 @@ class Numbers(AbstractParameters):
 
 def as_parameters(start: Any) -> AbstractParameters:
     """The start of an adjustment, which may be any tree of numbers, as parameters."""
-    return start if isinstance(start, AbstractParameters) else Numbers(start)
+    if isinstance(start, AbstractParameters):
+        return start
+    return Numbers(jax.tree.map(lambda number: jnp.asarray(number, float), start))
 
 
 def as_given(parameters: AbstractParameters) -> Any:

@@ -109,6 +109,11 @@ def discrepancy(
 
     def values(measured):
         g = condition(parameters, eqx.combine(measured, exact))
+        if isinstance(g, tuple | list):
+            raise ValueError(
+                f"Term: the condition returned a {type(g).__name__}; several conditions "
+                "of one observation are an array, jnp.stack([...])"
+            )
         return [g] if jnp.ndim(g) == 0 else [g[k] for k in range(g.shape[0])]
 
     g, pull = jax.vjp(values, measured)

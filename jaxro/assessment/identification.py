@@ -113,7 +113,7 @@ def identify(
     """
     pair, linear, known = _read(pair, orientation)
     limit = _limit(known, level, familywise)
-    found = critical.delta_normal(2 * ndtr(-limit), power)
+    found = jnp.asarray(critical.delta_normal(2 * ndtr(-limit), power))
     errors = _draw_errors(known, key, draws)
     correlation, partner = _partners(known)
 

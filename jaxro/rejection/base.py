@@ -32,9 +32,8 @@ class OUTCOMES(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "standard deviation is the right one."
     )
     did_not_rest = (
-        "The weights did not come to rest, so that the points rejected depend on the "
-        "number of rounds. Use another "
-        "weight function, or the procedure `recommended`."
+        "The rounds or weights did not come to rest, so that the points rejected depend "
+        "on the number of rounds. Use the procedure `recommended`."
     )
     no_choice = (
         "No choice of so few omissions as are tried passes the global test: more "

@@ -22,6 +22,7 @@ from .rounds import (
     finished_outcome,
     independent_values,
     repeat_rounds,
+    rounds_of_one,
 )
 
 
@@ -66,7 +67,7 @@ class DataSnooping(AbstractProcedure):
                 elements=independent_values(solved.pose),
             )
 
-        history = repeat_rounds(judge, pair, self.least)
+        history = repeat_rounds(judge, pair, rounds_of_one(pair, self.least))
         solved = orient(pair.with_mask(history.mask), start=start)
         _, _, wrong = self._test(pair, history.mask, solved.pose)
         undecided = wrong & (count(wrong) > 1)

@@ -31,6 +31,7 @@ from .rounds import (
     finished_outcome,
     largest,
     repeat_rounds,
+    rounds_of_one,
 )
 from .steps import inner
 
@@ -182,7 +183,7 @@ class LeaveOneOutGrubbs(AbstractProcedure):
                 elements=element_values(solved.elements),
             )
 
-        history = repeat_rounds(judge, pair, self.least)
+        history = repeat_rounds(judge, pair, rounds_of_one(pair, self.least))
         final = adjust_parallaxes(pair, history.mask)
         return conclude(history, final, finished_outcome(pair))
 

@@ -25,8 +25,10 @@ from .base import OUTCOMES, Log, PointValues, Rejection
 
 
 class Round(NamedTuple):
-    """One judgement of the points in use, with the fields of `Log`; `rejected`: the
-    points to leave out now."""
+    """One judgement of the points in use, with the fields of `Log`: the `statistic` of
+    every point, the `limit` it was compared with (one number), the points to leave out
+    now (one or several), the residual parallaxes and the elements of the orientation
+    that judged."""
 
     statistic: PointValues
     limit: Float[Array, "..."]
@@ -107,26 +109,30 @@ def add_round(
 
 
 def repeat_rounds(
-    judge: Callable[[Bool[Array, "point"]], Round], pair: Pair, least: int
+    judge: Callable[[Bool[Array, "point"]], Round], pair: Pair, most: int
 ) -> History:
-    """Rounds judge(points in use), until one rejects nothing. There is room for rounds
-    that reject one point each until `least` points are left, and one more."""
-    rounds = max(pair.x_left.shape[0] - least, 0) + 1
+    """Rounds judge(points in use), until one rejects nothing, `most` at most. How many
+    points are kept is the business of `judge`."""
 
     def more(state):
         history, rejecting = state
-        return rejecting & (history.rounds < rounds)
+        return rejecting & (history.rounds < most)
 
     def body(state):
         history, _ = state
         new = judge(history.mask)
         return add_round(history, new), count(new.rejected) > 0
 
-    history = empty_history(pair, rounds)
+    history = empty_history(pair, most)
     start = history, count(history.mask) > 0
     # any number that differs from pair to pair
     own = jnp.sum(history.log.limit)
     return while_loop(more, body, start, own)[0]
+
+
+def rounds_of_one(pair: Pair, least: int) -> int:
+    """Rounds that reject one point each until `least` points are left, and one more."""
+    return max(pair.x_left.shape[0] - least, 0) + 1
 
 
 def conclude(

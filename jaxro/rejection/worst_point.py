@@ -14,6 +14,7 @@ from .rounds import (
     finished_if,
     largest,
     repeat_rounds,
+    rounds_of_one,
 )
 
 
@@ -49,6 +50,6 @@ class WorstPoint(AbstractProcedure):
                 elements=element_values(solved.elements),
             )
 
-        history = repeat_rounds(judge, pair, self.least)
+        history = repeat_rounds(judge, pair, rounds_of_one(pair, self.least))
         final = adjust_parallaxes(pair, history.mask)
         return conclude(history, final, finished_if(enough))

@@ -419,3 +419,67 @@ def test_the_engine_knows_no_photo():
         }
         assert above <= seam, file.name
         assert "lements)" not in text, file.name
+
+
+def circle_by_gauss_and_helmert(x, y, variance_x, variance_y, start):
+    """x0, y0, r and their cofactors in plain NumPy, linearised anew at the adjusted
+    points in every turn."""
+    parameters, measured = np.array(start), np.stack([x, y])
+    q = np.stack([variance_x, variance_y])
+    points, inverse = measured.copy(), np.eye(3)
+    for _ in range(60):
+        away = points - parameters[:2, None]
+        by_point = 2 * away
+        by_parameter = np.stack(
+            [-2 * away[0], -2 * away[1], -2 * parameters[2] + 0 * x]
+        )
+        g = np.sum(away**2, axis=0) - parameters[2] ** 2
+        w = g + np.sum(by_point * (measured - points), axis=0)
+        weight = 1 / np.sum(by_point**2 * q, axis=0)
+        inverse = np.linalg.inv((by_parameter * weight) @ by_parameter.T)
+        step = -inverse @ ((by_parameter * weight) @ w)
+        correlates = weight * (w + step @ by_parameter)
+        parameters = parameters + step
+        points = measured - q * by_point * correlates
+    return parameters, inverse
+
+
+def test_conditions_linear_in_the_measurement_give_the_exact_minimum():
+    """A circle with an angle for each point, as docs/extending.md shows it."""
+    random = np.random.default_rng(3)
+    angle = np.linspace(0.2, 4.5, 12)
+    x, y = 7 + 4 * np.cos(angle), 5 + 4 * np.sin(angle)
+    sigma = np.stack([random.uniform(0.001, 0.05, 12), random.uniform(0.001, 0.05, 12)])
+    x, y = np.stack([x, y]) + sigma * random.normal(size=(2, 12))
+
+    def on_circle(circle, point, measured):
+        (x0, y0, radius), (angle,) = circle, point
+        x = x0 + radius * jnp.cos(angle) - measured[0]
+        return jnp.stack([x, y0 + radius * jnp.sin(angle) - measured[1]])
+
+    number = np.arange(12)
+    touches = [("circle", 0 * number), ("point", number)]
+    measured = jnp.asarray(x), jnp.asarray(y)
+    term = Term(on_circle, measured, tuple(jnp.asarray(sigma**2)), touches=touches)
+    start = {
+        "circle": (np.array([7]), np.array([5]), np.array([4])),
+        "point": (np.arctan2(y - 5, x - 7),),
+    }
+    found = adjust(term, start, eliminate="point")
+    expected, cofactor = circle_by_gauss_and_helmert(x, y, *sigma**2, (7.0, 5.0, 4.0))
+    ours = np.stack(found.parameters["circle"])[:, 0]
+    np.testing.assert_allclose(ours, expected, atol=1e-9)
+    np.testing.assert_allclose(
+        found.covariance("circle", sigma0=1)[0], cofactor, rtol=1e-9, atol=1e-15
+    )
+
+
+def test_a_start_and_a_condition_of_the_wrong_form_are_told():
+    term = Term(
+        lambda a, l: a[0] - l, jnp.ones(3), 1.0, touches=[("a", np.zeros(3, int))]
+    )
+    with pytest.raises(ValueError, match="array over all blocks"):
+        adjust(term, {"a": (8,)})
+    several = Term(lambda a, l: (a[0] - l, a[0]), jnp.ones(3), 1.0)
+    with pytest.raises(ValueError, match=r"returned a tuple.*jnp\.stack"):
+        adjust(several, (8,))
