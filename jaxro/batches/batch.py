@@ -9,7 +9,7 @@ up their chunk.
 """
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +23,8 @@ from ..orientation.orient import orient_near, orient_once
 from ..orientation.problem import Problem, problem_of
 from ..orientation.result import Orientation
 from ..orientation.starts import AbstractStart, Auto
-from ..rejection import OUTCOMES, AbstractProcedure, Recommended, Rejection
+from ..rejection import OUTCOMES, AbstractProcedure, Rejection
+from ..rejection.base import stages
 from ..rejection.hypotheses import AbstractHypotheses
 from ..rejection.search import Search
 from ..xla.kernels import one_kernel, one_kernel_fusing_points
@@ -197,16 +198,6 @@ def clean_batch(
     return _finish(out)
 
 
-def stages(procedure: AbstractProcedure, points: int) -> Sequence[AbstractProcedure]:
-    """The procedures to be tried in turn on pairs of up to so many points, each on
-    those that the one before left in doubt."""
-    return (
-        procedure.separate(points)
-        if isinstance(procedure, Recommended)
-        else (procedure,)
-    )
-
-
 def clean_in_stages(
     pairs: Pair,
     procedure: AbstractProcedure,
@@ -332,7 +323,7 @@ def _clean_slab(
     """What is selected, and whether the procedure was not convinced."""
 
     def one(pair: Pair):
-        rejection = procedure(pair)
+        rejection = procedure.clean(pair)
         return select(rejection), rejection.outcome == OUTCOMES.no_consensus
 
     return map_chunks(one, pairs, chunk)

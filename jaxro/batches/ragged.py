@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
 from ..geometry.pairs import Pair, double, pair
-from ..orientation.result import Orientation
+from ..orientation.result import PER_POINT, Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..rejection import AbstractProcedure, Rejection
 from ..xla.settings import keep_plain
@@ -166,10 +166,6 @@ def check(pairs: Ragged) -> Ragged:
             "the last"
         )
     return double(pairs)
-
-
-PER_POINT = ("parallax", "residuals", "redundancy", "model", "in_front")
-"""What an `Orientation` holds of every point."""
 
 
 def split(pair: Pair, orientation: Orientation) -> tuple[PyTree, PyTree]:

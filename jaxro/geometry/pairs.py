@@ -252,6 +252,21 @@ def pad(one: Pair, points: int) -> Pair:
     return _as_pair(_pad_fields(one, points, _library(one)))
 
 
+def room_for(points: int) -> int:
+    """The places that a single pair of so many points is padded to: 8, 12, 16, 24, 32,
+    48, ... A program is compiled for a number of places, not for each of points."""
+    size = 8
+    while size < points:
+        size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
+    return size
+
+
+def first_points(tree: PyTree, points: int) -> PyTree:
+    """The arrays of a tree without the places behind these points, by NumPy, which
+    compiles nothing for another number of points."""
+    return jax.device_put(jax.tree.map(lambda a: np.asarray(a)[..., :points], tree))
+
+
 def _pad_fields(one: Pair, points: int, xp: ModuleType) -> list:
     """New fields of a `Pair`, with so many places."""
     missing = points - one.x_left.shape[-1]

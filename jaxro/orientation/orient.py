@@ -11,7 +11,7 @@ from ..adjustment.losses import AbstractLoss
 from ..adjustment.terms import Term
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose
-from ..geometry.pairs import Pair, double, mask_unusable
+from ..geometry.pairs import Pair, double, mask_unusable, pad, room_for
 from ..xla.kernels import kernels_of_parts, one_kernel
 from ..xla.programs import Program, is_traced
 from ..xla.settings import FEW, settings_for
@@ -21,6 +21,10 @@ from .problem import Problem, as_array
 from .result import Orientation
 from .solve import Solution, solve
 from .verdict import verdict
+
+ANY_LENGTH = (coplanarity.rigorous, coplanarity.parallax)
+"""Residuals that may be asked for with more places than points; one of the user's may
+hold something of each point."""
 
 NEAR_STEPS = 10
 """Steps allowed from the vertical without a loss: near-vertical photos take four or
@@ -65,19 +69,24 @@ def orient(
     )
     pair = double(pair)
     if is_traced((pair, problem)):
-        return orient_once(pair, problem)
+        return Program(orient_once, {"problem": problem})(pair)
+    points = pair.x_left.size
     if not isinstance(start, starts.Auto):
-        return _run(orient_once, pair, problem, kernels_of_parts)
+        return _run(orient_once, pair, problem, kernels_of_parts).first(points)
     # two small programs instead of one large: the general start is compiled when a pair
     # first needs it
     orientation, fits = _run(orient_near, pair, problem, one_kernel)
-    if bool(fits):
-        return orientation
-    return _run(orient_once, pair, problem.starting(start.general), kernels_of_parts)
+    if not bool(fits):
+        problem = problem.starting(start.general)
+        orientation = _run(orient_once, pair, problem, kernels_of_parts)
+    return orientation.first(points)
 
 
 def _run(function: Callable, pair: Pair, problem: Problem, kernel: Callable) -> Any:
-    """function(pair, problem) by a program that compiles quickly."""
+    """function(pair, problem) by a program that compiles quickly, and serves other
+    numbers of points too."""
+    if problem.residual in ANY_LENGTH:
+        pair = pad(pair, room_for(pair.x_left.size))
     settings = settings_for(pair.x_left.size)
     # the compiler makes no kernel of a solver of the user's, and none of no points
     as_kernel = problem.solver is None and pair.x_left.size > 0

@@ -12,10 +12,13 @@ from ..adjustment import critical_values
 from ..adjustment.guarded import root, times
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose
-from ..geometry.pairs import Coordinates, Pair, mask_unusable
+from ..geometry.pairs import Coordinates, Pair, first_points, mask_unusable
 from ..xla.programs import Program, is_traced
 from ..xla.settings import RUN_FAST, settings_for
 from .results import RESULTS, is_usable
+
+PER_POINT = ("parallax", "residuals", "redundancy", "model", "in_front")
+"""What an `Orientation` holds of every point."""
 
 
 class Orientation(eqx.Module):
@@ -49,6 +52,13 @@ class Orientation(eqx.Module):
     degrees_of_freedom: Int[Array, "*pairs"]
     iterations: Int[Array, "*pairs"]
     result: RESULTS
+
+    def first(self, points: int) -> "Orientation":
+        """The same without the places behind so many points."""
+        if points == self.residuals.shape[-1]:
+            return self
+        of_points = lambda o: [getattr(o, name) for name in PER_POINT]
+        return eqx.tree_at(of_points, self, first_points(of_points(self), points))
 
     @property
     def parameters(self) -> AbstractElements:

@@ -53,7 +53,7 @@ class AllSubsets(AbstractProcedure):
     least: int = 6
     start: AbstractStart = Vertical()
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = orient(fixed, start=self.start(fixed).pose).pose

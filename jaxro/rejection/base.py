@@ -2,15 +2,18 @@
 
 import abc
 import dataclasses
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from ..geometry.pairs import Pair
+from ..geometry.pairs import Pair, double, first_points, pad, room_for
 from ..orientation.orient import Orientation
 from ..xla.passes import count
+from ..xla.programs import Program, is_traced
+from ..xla.settings import settings_for
 
 PointValues = Float[Array, "*pairs point"]
 
@@ -60,7 +63,8 @@ class Log(eqx.Module):
     wrong by any measure. `limit`: the value that rejects; infinite in a round that only
     iterates. `rejected`: the points this round rejects. `parallax`: the residual
     y-parallaxes of the points in use, and `elements` (phi1, kappa1, omega2, phi2,
-    kappa2) the orientation by which the round judged.
+    kappa2) the orientation by which the round judged. There may be room for more rounds
+    than there can be.
     """
 
     happened: Bool[Array, "*pairs round"]
@@ -89,6 +93,17 @@ class Rejection(eqx.Module):
     outcome: OUTCOMES
     undecided: Bool[Array, "*pairs point"]
 
+    def first(self, points: int) -> "Rejection":
+        """The same without the places behind so many points."""
+        if points == self.mask.shape[-1]:
+            return self
+        of_points = lambda r: [
+            *(r.mask, r.order, r.statistic, r.undecided),
+            *(r.log.statistic, r.log.rejected, r.log.parallax),
+        ]
+        short = eqx.tree_at(of_points, self, first_points(of_points(self), points))
+        return dataclasses.replace(short, orientation=self.orientation.first(points))
+
     def only_if(self, fine: Bool[Array, ""], otherwise: OUTCOMES) -> "Rejection":
         """The same result, with the outcome `otherwise` if it is not `fine`. A pair
         with nothing to test keeps its outcome."""
@@ -115,8 +130,51 @@ class Rejection(eqx.Module):
 
 class AbstractProcedure(eqx.Module):
     """A rule that finds wrong points in one pair. Its tolerances are its fields;
-    lengths are in the unit of the coordinates."""
+    lengths are in the unit of the coordinates.
+
+    `procedure(pair)` calls `clean` by a program that is compiled once and serves other
+    numbers of points, too; under jit, vmap and grad it is a part of the caller's.
+    """
 
     @abc.abstractmethod
+    def clean(self, pair: Pair) -> Rejection:
+        """Find the wrong points of one pair; works under jit and vmap. Places of the
+        pair may be masked."""
+
     def __call__(self, pair: Pair) -> Rejection:
-        """Find the wrong points of one pair; works under jit and vmap."""
+        """The wrong points of one pair."""
+        pair = double(pair)
+        if is_traced((pair, self)):
+            return _program(self, pair.x_left.size)(pair)
+        points = pair.x_left.size
+        pair = pad(pair, room_for(points))
+        for part in stages(self, points):
+            found = _program(part, points)(pair)
+            if bool(found.outcome != OUTCOMES.no_consensus):
+                break
+        return found.first(points)  # pyright: ignore[reportPossiblyUnboundVariable]
+
+
+@runtime_checkable
+class InStages(Protocol):
+    """A procedure that consists of others, each for the pairs that the one before left
+    in doubt."""
+
+    def separate(self, points: int) -> list[AbstractProcedure]:
+        """The procedures to be tried in turn on pairs of up to so many points."""
+        ...
+
+
+def stages(procedure: AbstractProcedure, points: int) -> list[AbstractProcedure]:
+    """The procedures to be tried in turn on pairs of up to so many points."""
+    if isinstance(procedure, InStages):
+        return procedure.separate(points)
+    return [procedure]
+
+
+def _program(procedure: AbstractProcedure, points: int) -> Program:
+    return Program(_clean, {"procedure": procedure}, settings_for(points))
+
+
+def _clean(pair: Pair, *, procedure: AbstractProcedure) -> Rejection:
+    return procedure.clean(pair)

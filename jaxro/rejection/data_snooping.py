@@ -50,7 +50,7 @@ class DataSnooping(AbstractProcedure):
     start: AbstractStart = Vertical()
     doubt: float = DOUBT
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         # the optimum does not depend on where it is sought
         start = self.start(lax.stop_gradient(pair)).pose

@@ -75,7 +75,7 @@ class Dorozhinsky(AbstractProcedure):
     corrections: int = 1
     least: int = 6
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = mask_unusable(pair)[0]
         history = self._reject_gross(pair)
         state = self._reject_by_mean(pair, history)

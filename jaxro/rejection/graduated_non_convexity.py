@@ -34,7 +34,7 @@ class GraduatedNonConvexity(AbstractSearch):
     rounds: int = 4
     start: AbstractStart = Vertical(steps=0)
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = self.search(fixed)

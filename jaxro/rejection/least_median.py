@@ -46,7 +46,7 @@ class LeastMedian(AbstractSearch):
     rounds: int = 2
     seed: int = 0
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = mask_unusable(pair)[0]
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose, median = self._find(fixed)

@@ -167,7 +167,7 @@ class LeaveOneOutGrubbs(AbstractProcedure):
     least: int = 6
     critical: Float[Array, "count"] | None = None
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = mask_unusable(pair)[0]
 
         def judge(mask):

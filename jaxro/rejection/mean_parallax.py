@@ -20,7 +20,7 @@ class MeanParallax(AbstractProcedure):
     more_than: int = 9
     least: int = 6
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         def judge(pair, solved):
             q = jnp.abs(solved.parallax)
             excess = q - mean_of(q, pair.mask)

@@ -65,7 +65,7 @@ class Ransac(AbstractSearch):
     seed: int = 0
     sigma: float | None = None
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         pose = self.search(fixed)

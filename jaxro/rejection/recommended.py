@@ -63,7 +63,7 @@ class Recommended(AbstractProcedure):
     stages: tuple[AbstractStage, ...] = (Plain(), Quick(), Thorough())
     known: bool = True
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         begin = jnp.ones_like(pair.focal_left) if self.known else _first_sigma(fixed)
@@ -104,7 +104,7 @@ class Recommended(AbstractProcedure):
             if isinstance(stage, Thorough)
         )
 
-    def separate(self, points: int) -> list["Recommended"]:
+    def separate(self, points: int) -> list[AbstractProcedure]:
         """Two procedures for batches: the first stages, which are quick for any number
         of pairs at once, and the search for the pairs that these left open."""
         if not self.known:

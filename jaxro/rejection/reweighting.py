@@ -64,7 +64,7 @@ class Reweighting(AbstractSearch):
     sigma: float | None = None
     start: AbstractStart = Vertical()
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
         fixed = lax.stop_gradient(pair)  # a decision has no derivative
         found = self._solve(fixed)

@@ -23,7 +23,7 @@ class ThreeSigma(AbstractProcedure):
     more_than: int = 9
     least: int = 6
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         def judge(pair, solved):
             q = jnp.abs(solved.parallax)
             limit = self.factor * solved.m_q

@@ -21,7 +21,7 @@ class TwoStage(AbstractProcedure):
     first: AbstractProcedure = Dorozhinsky()
     second: AbstractProcedure = LeaveOneOutGrubbs()
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         one = self.first(pair)
         two = self.second(pair.with_mask(one.mask))
         early, late = one.order > 0, two.order > 0

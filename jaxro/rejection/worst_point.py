@@ -30,7 +30,7 @@ class WorstPoint(AbstractProcedure):
     more_than: int = 9
     least: int = 6
 
-    def __call__(self, pair: Pair) -> Rejection:
+    def clean(self, pair: Pair) -> Rejection:
         pair = mask_unusable(pair)[0]
         enough = pair.count > self.more_than
 

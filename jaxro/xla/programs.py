@@ -47,7 +47,7 @@ class _Key:
 
 class Program:
     """data -> function(data, **options), compiled; arrays among the options are passed
-    along as arguments.
+    along as arguments. Works under jit, vmap and grad, compiled or not.
 
     `kernel`: `kernels.one_kernel` or the like, which the compiler may refuse; the
     program is then compiled without.
@@ -69,6 +69,10 @@ class Program:
         self._plain = switched_off()
 
     def __call__(self, data: PyTree) -> PyTree:
+        if is_traced((data, self._arrays)):
+            # compiled as a part of the caller's program, or, under a `grad` or `vmap`
+            # that nobody compiles, by itself and once
+            return _as_part(self._function, self._static)(data, self._arrays)
         if self._plain == switched_off():
             return self._call(data)
         with plain(self._plain):  # a thread that helps does not know of it
@@ -175,6 +179,11 @@ def pause_collection() -> Iterator[None]:
     finally:
         if collects:
             gc.enable()
+
+
+@lru_cache(maxsize=64)
+def _as_part(function: Callable, static: _Key) -> Callable:
+    return jax.jit(_flat(function, static))
 
 
 @lru_cache(maxsize=64)

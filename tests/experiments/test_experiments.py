@@ -69,7 +69,7 @@ class Informed(AbstractProcedure):
 
     limit: float | Float[Array, ""]
 
-    def __call__(self, pair) -> Rejection:
+    def clean(self, pair) -> Rejection:
         pair = mask_unusable(pair)[0]
         off = jnp.abs(pair.y_right - EXACT.y_right)
         bad = pair.mask & (off > self.limit)
