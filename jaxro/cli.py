@@ -17,10 +17,10 @@ except ModuleNotFoundError:
     ) from None
 
 from .commands import options as given
+from .commands.ending import end
 from .commands.options import Engine, Residual
 from .experiments import REPRODUCTIONS
 from .rejection import PROCEDURES
-from .tables.fields import TableError
 
 app = typer.Typer(
     add_completion=False,
@@ -31,7 +31,7 @@ app = typer.Typer(
 
 
 @app.callback()
-def main() -> None:
+def main(version: given.Version = False) -> None:
     """Photogrammetric relative orientation of measured stereo pairs."""
 
 
@@ -85,13 +85,13 @@ def orient(
     if given.large(file, parquet, resume, tables, engine):
         from .commands import large
 
-        _end(
+        end(
             lambda: large.run(
                 options, large.Large(tables, resume, engine=_engine(engine))
             )
         )
     else:
-        _end(lambda: run(options))
+        end(lambda: run(options))
 
 
 @app.command()
@@ -160,9 +160,9 @@ def clean(
         from .commands import large
 
         how = large.Large(tables, resume, engine=_engine(engine))
-        _end(lambda: large.run(options, how, choose_procedure(name, changes)))
+        end(lambda: large.run(options, how, choose_procedure(name, changes)))
     else:
-        _end(lambda: run(options, name, changes))
+        end(lambda: run(options, name, changes))
 
 
 @app.command()
@@ -200,7 +200,7 @@ def colmap(
     """
     from .commands.colmap import Options, run
 
-    _end(
+    end(
         lambda: run(
             Options(
                 database=database,
@@ -289,7 +289,7 @@ def compare(
         out=out,
         force=force,
     )
-    _end(lambda: run_comparison(options, wanted))
+    end(lambda: run_comparison(options, wanted))
 
 
 @app.command()
@@ -317,7 +317,7 @@ def reproduce(
     """Calculate a paper's tables beside the print."""
     from .commands import simulate
 
-    _end(lambda: simulate.reproduce(name, trials, seed))
+    end(lambda: simulate.reproduce(name, trials, seed))
 
 
 @app.command()
@@ -356,7 +356,7 @@ def heights(
     """
     from .commands.heights import Options, run
 
-    _end(
+    end(
         lambda: run(
             Options(
                 file=file,
@@ -418,7 +418,7 @@ def plan(
     """
     from .commands.plan import Options, run
 
-    _end(
+    end(
         lambda: run(
             Options(
                 focal=focal,
@@ -442,19 +442,3 @@ def _engine(name: Engine) -> Callable:
     from .commands.journal import here
 
     return {Engine.local: here, Engine.ray: on_ray}[name]
-
-
-def _end(work: Callable[[], bool]) -> None:
-    """Do the work with compiled programs kept; the exit code says how it ended."""
-    from .reports.terminal import abort
-    from .xla import store
-
-    store.use(store.default_folder())
-    try:
-        good = work()
-    except KeyboardInterrupt:
-        abort()
-    except TableError as error:
-        typer.secho(f"Error: {error}", err=True, fg="red")
-        raise typer.Exit(2) from None
-    raise typer.Exit(0 if good else 1)

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from .. import __version__
 from ..tables.whole import is_parquet
 
 
@@ -29,6 +30,20 @@ class Engine(enum.StrEnum):
 
     local = "local"
     ray = "ray"
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"jaxro {__version__}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool,
+    typer.Option(
+        "--version", help="Show the version.", callback=_show_version, is_eager=True
+    ),
+]
 
 
 COLUMNS = (

@@ -58,6 +58,11 @@ def orient(
             "orient takes one pair, but the coordinates have shape "
             f"{pair.x_left.shape}: use jax.vmap(orient), or orient_batch"
         )
+    if loss is not None and not isinstance(loss, AbstractLoss):
+        raise TypeError(
+            f"orient: loss is an object of jaxro.losses, such as losses.Huber(), got "
+            f"{loss!r}"
+        )
     problem = Problem(
         elements=elements,
         base=as_array(base),

@@ -1,5 +1,6 @@
 """The result of an orientation."""
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -52,6 +53,34 @@ class Orientation(eqx.Module):
     degrees_of_freedom: Int[Array, "*pairs"]
     iterations: Int[Array, "*pairs"]
     result: RESULTS
+
+    def __str__(self) -> str:
+        """The elements with their standard deviations, and sigma0; of a batch how many
+        pairs are usable."""
+        if is_traced(self):
+            return repr(self)
+        if jnp.ndim(self.sigma0):
+            usable = int(np.sum(np.asarray(self.usable)))
+            return f"{usable} of {np.size(self.sigma0)} pairs usable"
+        lines = [RESULTS[self.result].split(":")[0] or "successful"]
+        deviations = np.asarray(self.deviations)
+        if isinstance(self.elements, RelativePose):
+            lines += _describe_pose(self.elements)
+        for name, value, deviation, angle in zip(
+            self.elements.names,
+            self.elements.values(),
+            deviations,
+            self.elements.angles,
+            strict=True,
+        ):
+            factor, unit = (math.degrees(1.0), "°") if angle else (1.0, "")
+            # those of a pose are small turns from it, which are zero
+            is_local = isinstance(self.elements, RelativePose)
+            shown = "" if is_local else f"{float(value) * factor:.6g} "
+            lines.append(f"{name} {shown}± {deviation * factor:.2g}{unit}")
+        freedom = int(self.degrees_of_freedom)
+        lines.append(f"sigma0 {float(self.sigma0):.3g}, {freedom} degrees of freedom")
+        return "\n".join(lines)
 
     def first(self, points: int) -> "Orientation":
         """The same without the places behind so many points."""
@@ -154,6 +183,19 @@ class Orientation(eqx.Module):
                 "oriented; see result"
             )
         return self
+
+
+def _describe_pose(pose: RelativePose) -> list[str]:
+    """The base and the rotation of the right photo, as lines."""
+    axis = np.array([pose.qx, pose.qy, pose.qz], float)
+    sine = float(np.linalg.norm(axis))
+    angle = math.degrees(2 * math.atan2(sine, float(pose.qw)))
+    numbers = lambda values: " ".join(f"{float(value):.5f}" for value in values)
+    about = f" about {numbers(axis / sine)}" if sine > 0 else ""
+    return [
+        f"base {numbers((pose.bx, pose.by, pose.bz))}",
+        f"rotation {angle:.5f}°{about}",
+    ]
 
 
 def _corrections_of(data: tuple[RelativePose, Pair]) -> Coordinates:

@@ -3,6 +3,7 @@ is."""
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NoReturn
@@ -30,6 +31,30 @@ def abort() -> NoReturn:
     sys.stdout.flush()
     print("Aborted.", file=sys.stderr, flush=True)
     os._exit(130)
+
+
+SOON = 1.0
+"""Seconds after which a user is told what he waits for."""
+
+
+@contextmanager
+def say_compiling(shape: tuple[int, ...]) -> Iterator[None]:
+    """Around a compilation for pairs of this shape: a line on the terminal if it takes
+    longer than SOON."""
+    *pairs, points = shape or (0,)
+    of = f"{pairs[0]} pairs of up to " if pairs and pairs[0] > 1 else ""
+    line = f"Compiling for {of}{points} points, once on this machine ..."
+    if not sys.stderr.isatty():
+        yield
+        return
+    say = lambda: print(line, file=sys.stderr, flush=True)
+    timer = threading.Timer(SOON, say)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 @contextmanager

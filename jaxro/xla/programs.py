@@ -7,7 +7,7 @@ off by `settings.plain` is part of every key.
 
 import gc
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import lru_cache, wraps
 from typing import Any
 
@@ -28,6 +28,17 @@ from .settings import (
     plain,
     switched_off,
 )
+
+Watch = Callable[[tuple[int, ...]], AbstractContextManager]
+"""Of the shape of the first array of the data: what surrounds a compilation."""
+
+_watch: Watch | None = None
+
+
+def watch(surround: Watch) -> None:
+    """Let `surround` be around every compilation from now on, to say what is awaited."""
+    global _watch
+    _watch = surround
 
 
 class _Key:
@@ -106,18 +117,22 @@ class Program:
     def _run(self, data: PyTree, function: Callable, settings: tuple) -> PyTree:
         key = self._function, self._static, settings, self._plain
         arguments = data, self._arrays
-        if store.active():
-            shapes = tuple(
-                (np.shape(a), str(a.dtype)) for a in jax.tree.leaves(arguments)
-            )
-            stored = _remembered(*key).setdefault("stored", {})
-            if shapes not in stored:
+        if _watch is None and not store.active():
+            return _compile(function, *key[1:])(*arguments)
+        shapes = tuple((np.shape(a), str(a.dtype)) for a in jax.tree.leaves(arguments))
+        known = _remembered(*key).setdefault("programs", {})
+        if shapes in known:
+            return known[shapes](*arguments)
+        with _watch(shapes[0][0] if shapes else ()) if _watch else nullcontext():
+            if store.active():
                 flat = _flat(function, self._static)
-                stored[shapes] = store.load_or_compile(
-                    flat, known_settings(dict(settings)), arguments, key
-                )
-            return stored[shapes](arguments)
-        return _compile(function, *key[1:])(*arguments)
+                options = known_settings(dict(settings))
+                program = store.load_or_compile(flat, options, arguments, key)
+            else:
+                program = _compile(function, *key[1:])
+            found = program(*arguments)
+        known[shapes] = program
+        return found
 
     @property
     def outputs(self) -> dict[Any, PyTree]:

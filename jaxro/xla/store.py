@@ -3,8 +3,9 @@
 Off unless a caller names a folder (`use`): the command line does, a library call writes
 nothing. A program is found again by everything it depends on: the source of this
 package, the versions of those it stands on, the processor, the compiler settings, the
-static options and the shapes. The files are pickles: a folder that everybody may write
-to, or that belongs to somebody else, is not used.
+static options and the shapes. The files are pickles, which may do anything when they
+are read: a folder that others may write to, or that belongs to somebody else, is not
+used, links are not followed, and a file counts only if it is the user's own and whole.
 """
 
 import hashlib
@@ -26,6 +27,8 @@ from jaxtyping import PyTree
 MAX_PROGRAMS = 40
 """Programs kept, of about 1 MB each; the oldest go."""
 
+DIGEST = hashlib.sha256().digest_size
+
 _folder: Path | None = None
 
 
@@ -39,10 +42,12 @@ def use(folder: Path | None) -> None:
 def _is_ours(folder: Path) -> bool:
     try:
         there = folder.stat()
-    except OSError:
+    except FileNotFoundError:
         return True  # it will be made
+    except OSError:
+        return False
     return not hasattr(os, "getuid") or (
-        there.st_uid == os.getuid() and not there.st_mode & 0o002
+        there.st_uid == os.getuid() and not there.st_mode & 0o022
     )
 
 
@@ -51,11 +56,12 @@ def default_folder() -> Path | None:
     JAXRO_CACHE is empty."""
     if "JAXRO_CACHE" in os.environ:
         return Path(os.environ["JAXRO_CACHE"]) if os.environ["JAXRO_CACHE"] else None
-    root = (
-        os.environ.get("XDG_CACHE_HOME")
-        or os.environ.get("LOCALAPPDATA")
-        or Path.home() / ".cache"
-    )
+    root = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    if not root:
+        try:
+            root = Path.home() / ".cache"
+        except RuntimeError:  # a user without a home
+            return None
     return Path(root) / "jaxro"
 
 
@@ -84,7 +90,7 @@ def load_or_compile(
         TypeError,
     ):  # a lambda among the options has no name to be found by
         program = jax.jit(function, compiler_options=settings)
-        return lambda data: program(*data)
+        return program
     path = (_folder or Path()) / f"{hashlib.sha256(content).hexdigest()}.program"
     stored = _read(path)
     if stored is None:
@@ -111,7 +117,7 @@ def load_or_compile(
     else:
         program, like = stored
     out_structure = jax.tree.structure(like)
-    return lambda data: jax.tree.unflatten(
+    return lambda *data: jax.tree.unflatten(
         out_structure, program(*jax.tree.leaves(data))
     )
 
@@ -127,9 +133,8 @@ def _pickle_in_full(value: Any) -> bytes:
 
 
 def _read(path: Path) -> tuple[Callable, PyTree] | None:
-    try:
-        content = path.read_bytes()
-    except OSError:
+    content = _read_own(path)
+    if content is None:
         return None
     try:
         *executable, like = pickle.loads(content)
@@ -142,14 +147,37 @@ def _read(path: Path) -> tuple[Callable, PyTree] | None:
         return None
 
 
+def _read_own(path: Path) -> bytes | None:
+    """What `_write` wrote; None for a link, for a file that another user owns or may
+    write to, and for one that is not as it was written."""
+    try:
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+        with os.fdopen(handle, "rb") as file:
+            there = os.fstat(handle)
+            if hasattr(os, "getuid") and (
+                there.st_uid != os.getuid() or there.st_mode & 0o022
+            ):
+                return None
+            digest, content = file.read(DIGEST), file.read()
+    except OSError:
+        return None
+    return content if hashlib.sha256(content).digest() == digest else None
+
+
 def _write(path: Path, content: bytes) -> None:
     """The whole file or none; a folder that cannot be written to costs only time."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not _is_ours(path.parent):
+            return
         handle, temporary = tempfile.mkstemp(dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(temporary, path)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(content).digest() + content)
+            os.replace(temporary, path)
+        except OSError:
+            os.unlink(temporary)  # no drafts are left
+            raise
         newest_first = sorted(
             path.parent.glob("*.program"),
             key=lambda file: file.stat().st_mtime,

@@ -110,3 +110,14 @@ def test_a_cleaned_pair_of_any_length_is_that_of_its_own_program():
     compare(found.orientation, expected.orientation)
     np.testing.assert_array_equal(found.mask, expected.mask)
     np.testing.assert_array_equal(found.order, expected.order)
+
+
+def test_an_orientation_shows_its_numbers():
+    pair = near_vertical(12)
+    shown = str(jaxro.orient(pair, elements=jaxro.DependentElements))
+    assert shown.startswith("successful\nby ")
+    assert "kappa" in shown
+    assert shown.endswith("7 degrees of freedom")
+    assert "rotation" in str(jaxro.orient(pair))
+    batch = jax.tree.map(lambda a: jnp.stack([a, a]), pair)
+    assert str(jaxro.orient_batch(batch)) == "2 of 2 pairs usable"
