@@ -17,7 +17,7 @@ from ..xla.programs import Program, is_traced
 from ..xla.settings import FEW, settings_for
 from . import starts
 from .describe import Description, describe
-from .problem import Problem, as_array
+from .problem import FOR_CALLERS, Problem, as_array
 from .result import Orientation
 from .solve import Solution, solve
 from .verdict import verdict
@@ -74,6 +74,8 @@ def orient(
     )
     pair = double(pair)
     if is_traced((pair, problem)):
+        if isinstance(start, starts.Auto):
+            problem = problem._replace(tolerance=FOR_CALLERS)
         return Program(orient_once, {"problem": problem})(pair)
     points = pair.x_left.size
     if not isinstance(start, starts.Auto):

@@ -15,13 +15,21 @@ from ..geometry.elements import AbstractElements, DependentElements, RelativePos
 from ..geometry.pairs import Pair
 from .starts import AbstractStart, Auto
 
+TOLERANCE = 1e-12
+
+FOR_CALLERS = 1e-10
+"""The tolerance of `orient` as a part of a caller's program, for whom time is worth
+more than a last step."""
+
 
 class Problem(NamedTuple):
     """`elements`: the system of the result. `base`: its given length, if any.
     `residual`: what is minimised, a `Term` of the pair. `loss`: a robust loss in place
     of the sum of squares. `start`: where to begin, a start or known elements. `solver`:
     that of the engine, if None. `max_steps`: 30 if None, 300 with a loss, whose
-    reweighted steps converge linearly.
+    reweighted steps converge linearly. `tolerance`: steps (rad) below it end the
+    adjustment; with TOLERANCE a pair alone and in a batch, begun here or there, ends at
+    the same numbers.
     """
 
     elements: type[AbstractElements] = RelativePose
@@ -31,6 +39,7 @@ class Problem(NamedTuple):
     start: AbstractStart | AbstractElements = Auto()
     solver: optx.AbstractLeastSquaresSolver | None = None
     max_steps: int | None = None
+    tolerance: float = TOLERANCE
 
     @property
     def most_steps(self) -> int:

@@ -14,10 +14,6 @@ from . import starts
 from .problem import Problem
 from .starts import StartingPose
 
-TOLERANCE = 1e-12
-"""Steps (rad) below it end the adjustment: a pair alone and in a batch, begun here or
-there, ends at the same numbers."""
-
 LONGEST = 0.5
 """Longest component of a step (rad): beyond it the linearisation means nothing."""
 
@@ -32,7 +28,7 @@ class Solution(NamedTuple):
 def solve(pair: Pair, problem: Problem) -> Solution:
     """The solution of a pair whose masked points are zero."""
     start = _begin(pair, problem.start)
-    own = GaussNewton(TOLERANCE, TOLERANCE, max_step=LONGEST)
+    own = GaussNewton(problem.tolerance, problem.tolerance, max_step=LONGEST)
     adjustment = adjust(
         problem.residual(pair),
         start.pose,
