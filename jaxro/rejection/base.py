@@ -142,7 +142,12 @@ class AbstractProcedure(eqx.Module):
         pair may be masked."""
 
     def __call__(self, pair: Pair) -> Rejection:
-        """The wrong points of one pair."""
+        """The wrong points of one pair. Raises ValueError for a batch."""
+        if pair.x_left.ndim != 1:
+            raise ValueError(
+                "a procedure takes one pair, but the coordinates have shape "
+                f"{pair.x_left.shape}: use jax.vmap, or clean_batch"
+            )
         pair = double(pair)
         if is_traced((pair, self)):
             return _program(self, pair.x_left.size)(pair)
