@@ -32,10 +32,11 @@ class Engine(enum.StrEnum):
     ray = "ray"
 
 
-def _show_version(wanted: bool) -> None:
+def _show_version(wanted: bool) -> bool:
     if wanted:
         typer.echo(f"jaxro {__version__}")
         raise typer.Exit
+    return wanted
 
 
 Version = Annotated[
