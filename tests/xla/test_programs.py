@@ -79,4 +79,4 @@ import jaxro
 jaxro.orient(jaxro.pair(*4 * [[1.0, -2.0, 5.0, -6.0, 3.0, 8.0]], focal=100.0))
 """
     subprocess.run([sys.executable, "-c", code], check=True)
-    assert any("flat" in file.name for file in tmp_path.iterdir())
+    assert any("orient_near" in file.name for file in tmp_path.iterdir())
