@@ -120,7 +120,8 @@ class Program:
         if _watch is None and not store.active():
             return _compile(function, *key[1:])(*arguments)
         shapes = tuple((np.shape(a), str(a.dtype)) for a in jax.tree.leaves(arguments))
-        known = _remembered(*key).setdefault("programs", {})
+        where = "stored" if store.active() else "compiled"
+        known = _remembered(*key).setdefault(where, {})
         if shapes in known:
             return known[shapes](*arguments)
         with _watch(shapes[0][0] if shapes else ()) if _watch else nullcontext():
