@@ -12,8 +12,8 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,13 +59,6 @@ CALLS = {
     ),
 }
 """Code in Python, and how many times a bare process it may take."""
-
-
-class Table(NamedTuple):
-    """A table of pairs as the command line reads it."""
-
-    path: Path
-    clean: str
 
 
 def seconds_of(command: Sequence[str], **environment: str) -> float:
@@ -124,7 +117,7 @@ def first(size: Size) -> list[Metric]:
         metrics.append(Metric("first: bare JAX process", bare, "s", "lower"))
         for label, command, goal, later in _commands(folder):
             cache = folder / f"cache {label}"
-            run = lambda: seconds_of([*script, *command], JAXRO_CACHE=str(cache))  # noqa: B023
+            run = partial(seconds_of, [*script, *command], JAXRO_CACHE=str(cache))
             metrics.append(_metric(f"first: {label}", run() / bare, goal))
             if later is not None:
                 again = statistics.median(run() for _ in range(size.processes))

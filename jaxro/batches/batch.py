@@ -48,10 +48,10 @@ ALONE = 1 << 15
 begun."""
 
 SHORT, SOON = 1 << 13, 1 << 17
-"""Points of a batch up to which a program runs for milliseconds and, that of a general
-start or a procedure, for seconds. The shorter it runs, the sooner it
-has to be compiled: up to SHORT pairs go through one by one, without `vmap`, which
-doubles what there is to compile."""
+"""Points of a batch up to which a program runs for milliseconds, and up to which that
+of a general start or of a procedure runs for seconds. The shorter it runs, the sooner
+it has to be compiled. Up to SHORT points pairs go through one by one: `vmap` doubles
+what there is to compile."""
 
 
 def _everything(result: Any) -> Any:

@@ -14,7 +14,7 @@ from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.pairs import Pair, double, mask_unusable, pad, room_for
 from ..xla.kernels import kernels_of_parts, one_kernel
 from ..xla.programs import Program, is_traced
-from ..xla.settings import FEW, settings_for
+from ..xla.settings import settings_for
 from . import starts
 from .describe import Description, describe
 from .problem import FOR_CALLERS, Problem, as_array
@@ -25,6 +25,9 @@ from .verdict import verdict
 ANY_LENGTH = (coplanarity.rigorous, coplanarity.parallax)
 """Residuals that may be asked for with more places than points; one of the user's may
 hold something of each point."""
+
+EXACT_AT_ONCE = 32
+"""Places of a pair up to which the first step from the vertical is an exact one."""
 
 NEAR_STEPS = 10
 """Steps allowed from the vertical without a loss: near-vertical photos take four or
@@ -117,7 +120,7 @@ def orient_near(pair: Pair, problem: Problem) -> tuple[Orientation, Bool[Array, 
     assert isinstance(auto, starts.Auto)
     plain = problem.loss is None
     allowed = min(most, NEAR_STEPS) if plain else most
-    first_order = plain and pair.x_left.shape[0] > FEW
+    first_order = plain and pair.x_left.shape[0] > EXACT_AT_ONCE
     vertical = starts.Vertical(steps=int(first_order))
     problem = problem.starting(vertical, max_steps=allowed)
 

@@ -55,17 +55,21 @@ class Orientation(eqx.Module):
     result: RESULTS
 
     def __str__(self) -> str:
-        """The elements with their standard deviations, and sigma0; of a batch how many
-        pairs are usable."""
+        """The elements with their standard deviations, and sigma0; why there are none;
+        of a batch how many pairs are usable."""
         if is_traced(self):
             return repr(self)
         if jnp.ndim(self.sigma0):
             usable = int(np.sum(np.asarray(self.usable)))
             return f"{usable} of {np.size(self.sigma0)} pairs usable"
+        if not bool(self.usable):
+            return RESULTS[self.result]
         lines = [RESULTS[self.result].split(":")[0] or "successful"]
         deviations = np.asarray(self.deviations)
-        if isinstance(self.elements, RelativePose):
-            lines += _describe_pose(self.elements)
+        # those of a pose are small turns from it, which are zero
+        is_local = isinstance(self.elements, RelativePose)
+        if is_local:
+            lines += _describe_pose(self.pose)
         for name, value, deviation, angle in zip(
             self.elements.names,
             self.elements.values(),
@@ -74,8 +78,6 @@ class Orientation(eqx.Module):
             strict=True,
         ):
             factor, unit = (math.degrees(1.0), "°") if angle else (1.0, "")
-            # those of a pose are small turns from it, which are zero
-            is_local = isinstance(self.elements, RelativePose)
             shown = "" if is_local else f"{float(value) * factor:.6g} "
             lines.append(f"{name} {shown}± {deviation * factor:.2g}{unit}")
         freedom = int(self.degrees_of_freedom)

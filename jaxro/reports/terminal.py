@@ -10,6 +10,8 @@ from typing import NoReturn
 
 from rich.console import Console
 
+from ..xla import store
+
 
 def consoles() -> tuple[Console, Console]:
     """(for reports, for warnings and progress)."""
@@ -43,7 +45,8 @@ def say_compiling(shape: tuple[int, ...]) -> Iterator[None]:
     longer than SOON."""
     *pairs, points = shape or (0,)
     of = f"{pairs[0]} pairs of up to " if pairs and pairs[0] > 1 else ""
-    line = f"Compiling for {of}{points} points, once on this machine ..."
+    once = ", once on this machine" if store.active() else ""
+    line = f"Compiling for {of}{points} points{once} ..."
     if not sys.stderr.isatty():
         yield
         return

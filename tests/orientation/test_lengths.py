@@ -55,6 +55,7 @@ def test_a_pair_of_any_length_is_that_of_its_own_program(points):
     alone = jaxro.orient(pair)
     assert alone.residuals.shape == (points,)
     expected = jax.jit(jaxro.orient)(pair)
+    assert bool(alone.result == expected.result)
     if not bool(expected.usable):
         assert not bool(alone.usable)
         return
@@ -62,8 +63,7 @@ def test_a_pair_of_any_length_is_that_of_its_own_program(points):
 
 
 def test_a_length_that_is_new_compiles_nothing():
-    """Of the two programs near the vertical each serves its lengths; the last one is
-    not counted."""
+    """Nine to twelve points have twelve places: one program serves them all."""
     jaxro.orient(near_vertical(12))
     data_snooping = DataSnooping(sigma=0.01)
     data_snooping(near_vertical(12))
