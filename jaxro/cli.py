@@ -45,6 +45,7 @@ def orient(
     principal_point: given.PrincipalPoint = None,
     pixel_size: given.PixelSize = None,
     y_down: given.YDown = False,
+    semicolons: given.Semicolons = False,
     sigma: given.Sigma = None,
     elements: given.Elements = None,
     base: given.Base = None,
@@ -73,6 +74,7 @@ def orient(
         principal_point=principal_point,
         pixel_size=pixel_size,
         y_down=y_down,
+        semicolons=semicolons,
         sigma=sigma,
         elements=elements,
         base=base,
@@ -120,6 +122,7 @@ def clean(
     principal_point: given.PrincipalPoint = None,
     pixel_size: given.PixelSize = None,
     y_down: given.YDown = False,
+    semicolons: given.Semicolons = False,
     sigma: given.Sigma = None,
     elements: given.Elements = None,
     base: given.Base = None,
@@ -147,6 +150,7 @@ def clean(
         principal_point=principal_point,
         pixel_size=pixel_size,
         y_down=y_down,
+        semicolons=semicolons,
         sigma=sigma,
         elements=elements,
         base=base,
@@ -240,6 +244,7 @@ def compare(
     principal_point: given.PrincipalPoint = None,
     pixel_size: given.PixelSize = None,
     y_down: given.YDown = False,
+    semicolons: given.Semicolons = False,
     sigma: Annotated[
         float | None,
         typer.Option(
@@ -276,6 +281,7 @@ def compare(
         principal_point=principal_point,
         pixel_size=pixel_size,
         y_down=y_down,
+        semicolons=semicolons,
         sigma=sigma,
         unit=unit,
     )
@@ -337,6 +343,7 @@ def heights(
     camera_height: given.CameraHeight = None,
     base: given.HorizontalBase = None,
     sd: given.Deviation = None,
+    semicolons: given.Semicolons = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -367,6 +374,7 @@ def heights(
                 deviations=sd or [],
                 out=out,
                 force=force,
+                semicolons=semicolons,
             )
         )
     )

@@ -15,13 +15,16 @@ older ones, and its transaction keeps what was written before an error.
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
 
-from ..tables.fields import TableError
+from ..tables.fields import TableError, tell
+
+LONGEST_ROW = 100
+"""Letters of what a row is called in an error."""
 
 MOST_IMAGES = 2147483647
 NEEDED = {
@@ -90,8 +93,20 @@ class Database:
         self, table: str, row: str | None, column: str | None, found: str, expected: str
     ) -> TableError:
         """What is wrong, and where."""
-        place = ", ".join([str(self.file), f"table {table}", *([row] if row else [])])
+        place = ", ".join(
+            [
+                str(self.file),
+                f"table {table}",
+                *([tell(row, LONGEST_ROW)] if row else []),
+            ]
+        )
         return TableError(place, found=found, expected=expected, column=column)
+
+    def _whole(self, table: str, row: str, column: str, value: object) -> None:
+        """Raises TableError unless a value, which SQLite may have of any type in any
+        column, is a whole number that counts something."""
+        if not isinstance(value, int) or value < 0:
+            raise self.error(table, row, column, repr(value), "a whole number from 0")
 
     def _rows(self, table: str) -> Iterator[tuple]:
         """The needed columns of all rows, in the order of their numbers."""
@@ -102,12 +117,19 @@ class Database:
         """(number, number of matches) of every matched pair, in the order of the
         numbers."""
         query = "SELECT pair_id, rows FROM matches ORDER BY pair_id"
-        return self._connection.execute(query).fetchall()
+        found = self._connection.execute(query).fetchall()
+        for pair_id, rows in found:
+            self._whole("matches", f"pair_id {pair_id}", "pair_id", pair_id)
+            self._whole("matches", f"pair_id {pair_id}", "rows", rows)
+        return found
 
     def images(self, pair_ids: list[int]) -> dict[int, Image]:
         """The images of these pairs by number. Raises TableError where one is
         missing."""
-        known = {number: Image(*rest) for number, *rest in self._rows("images")}
+        known = {
+            number: Image(str(name), camera)
+            for number, name, camera in self._rows("images")
+        }
         found = {}
         for pair_id in pair_ids:
             for number in images_of(pair_id):
@@ -126,8 +148,9 @@ class Database:
         only guessed, unless it is to be taken as calibrated."""
         rows = {number: rest for number, *rest in self._rows("cameras")}
         for number, image in images.items():
+            row = _row_of(number, image)
+            self._whole("images", row, "camera_id", image.camera)
             if image.camera not in rows:
-                row = _row_of(number, image)
                 expected = "a camera of the table cameras"
                 raise self.error(
                     "images", row, "camera_id", str(image.camera), expected
@@ -145,7 +168,7 @@ class Database:
         return found
 
     def _camera(
-        self, number: int, model: int, params: bytes | None, known: int
+        self, number: int, model: Any, params: object, known: object
     ) -> pycolmap.Camera:
         row = f"camera_id {number}"
         if model not in MODELS:
@@ -177,6 +200,8 @@ class Database:
             if number not in images:
                 continue
             row = f"image_id {number}"
+            self._whole("keypoints", row, "rows", rows)
+            self._whole("keypoints", row, "cols", cols)
             if cols < 2:
                 expected = "x and y, and what describes the shape"
                 raise self.error("keypoints", row, "cols", str(cols), expected)
@@ -200,6 +225,7 @@ class Database:
         for number in pair_ids:
             rows, cols, data = self._connection.execute(query, (number,)).fetchone()
             row = f"pair_id {number}"
+            self._whole("matches", row, "rows", rows)
             if rows and cols != 2:
                 expected = "2, the places of a keypoint in either image"
                 raise self.error("matches", row, "cols", str(cols), expected)
@@ -224,14 +250,14 @@ class Database:
         table: str,
         row: str,
         column: str,
-        data: bytes | None,
+        data: object,
         dtype: str,
         count: int,
         why: str,
     ) -> np.ndarray:
         """The numbers of a blob. Raises TableError unless it has so many."""
-        if isinstance(data, str):
-            raise self.error(table, row, column, "text", "bytes")
+        if not isinstance(data, bytes | None):
+            raise self.error(table, row, column, repr(data), "bytes")
         size, each = len(data or b""), np.dtype(dtype).itemsize
         if size != count * each:
             expected = f"{count * each} bytes: {why} {count} numbers of {each} bytes"

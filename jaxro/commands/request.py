@@ -45,6 +45,7 @@ class Options:
     out: Path | None = None
     force: bool = False
     confidence: float | None = None
+    semicolons: bool = False
 
 
 class Example(NamedTuple):

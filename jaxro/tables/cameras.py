@@ -100,16 +100,19 @@ def read(path: Path) -> Cameras:
     """The cameras of a TOML file. Raises TableError."""
     text = read_text(path)
     try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        return _cameras(path, text, tomllib.loads(text))
+    except TableError:
+        raise
+    except ValueError as error:  # also of whole numbers with thousands of digits
         line = re.search(r"at line (\d+)", str(error))
-        where = int(line[1]) if line else None
-        raise TableError(
-            path,
-            line=where,
-            found=f"no valid TOML ({error})",
-            expected=f"the tables {FORMS}",
-        ) from None
+        where, found = int(line[1]) if line else None, f"no valid TOML ({error})"
+    except RecursionError:
+        where, found = None, "lists or tables within each other, too deep to be read"
+    raise TableError(path, line=where, found=found, expected=f"the tables {FORMS}")
+
+
+def _cameras(path: Path, text: str, tables: dict[str, Any]) -> Cameras:
+    """The cameras of the tables of a TOML file. Raises TableError."""
     names = set(tables)
     if names == {"photo"} and isinstance(tables["photo"], dict) and tables["photo"]:
         return Cameras(

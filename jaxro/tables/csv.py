@@ -16,13 +16,13 @@ from .fields import TableError, read_text
 from .measured import COLUMNS, NUMBERS, Measurements, Table, of_pairs
 
 
-def read(path: Path) -> Table:
+def read(path: Path, semicolons: bool = False) -> Table:
     """The pairs of a CSV file; without a column `pair` one pair, named after the file.
-    Raises TableError."""
-    return parse(read_text(path), str(path), path.stem)
+    `semicolons` as in `fields.lines_of`. Raises TableError."""
+    return parse(read_text(path), str(path), path.stem, semicolons)
 
 
-def parse(text: str, file: str, name: str) -> Table:
+def parse(text: str, file: str, name: str, semicolons: bool = False) -> Table:
     """The pairs of CSV text. `file` is named in errors, `name` is the pair's where the
     table has no column `pair`."""
     line = 1
@@ -31,7 +31,7 @@ def parse(text: str, file: str, name: str) -> Table:
     places: dict[tuple, str] = {}
     twins: dict[str, list[str]] = {}
     for line, pair, point, values in check_lines(
-        io.StringIO(text, newline=""), file, name
+        io.StringIO(text, newline=""), file, name, semicolons
     ):
         first = seen.setdefault(pair, {}).setdefault(point, line)
         if first != line:
@@ -66,21 +66,23 @@ def no_points(file: str, line: int) -> TableError:
     )
 
 
-def lines(path: Path) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
+def lines(
+    path: Path, semicolons: bool = False
+) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
     """The `check_lines` lines of a file, one at a time. Raises TableError."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            yield from check_lines(file, str(path))
+            yield from check_lines(file, str(path), semicolons=semicolons)
     except (OSError, UnicodeDecodeError):
         read_text(path)  # says which
 
 
 def check_lines(
-    text: Iterable[str], file: str, name: str = ""
+    text: Iterable[str], file: str, name: str = "", semicolons: bool = False
 ) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
     """(line number, pair, point, numbers) of every line below the header, each field
     looked at. Raises TableError."""
-    for line, cells in fields.lines_of(text, file, COLUMNS):
+    for line, cells in fields.lines_of(text, file, COLUMNS, semicolons):
         point = fields.name(cells["point"], file, line, "point")
         pair = (
             fields.name(cells["pair"], file, line, "pair") if "pair" in cells else name

@@ -3,9 +3,35 @@ column, what was found there, what was expected. Nothing is skipped or guessed."
 
 import csv
 import math
+import re
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+
+MOST_FOUND = 200
+"""Letters of what was found that are told: a whole file may stand in one field."""
+
+MOST_EXPECTED = 500
+"""Letters of what was expected that are told: names of the file may be among them."""
+
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d*(e[-+]?\d+)?", re.IGNORECASE)
+"""A number with a decimal comma."""
+
+
+def tell(text: str, most: int | None = None) -> str:
+    """Text of a user as it may be shown: its control characters replaced, and no longer
+    than `most` letters."""
+    if most is not None and len(text) > most:
+        text = text[: most - 4] + " ..."
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join("\ufffd" if _is_control(letter) else letter for letter in text)
+
+
+def _is_control(letter: str) -> bool:
+    """Whether a letter is none but moves, hides or turns others, or is half of one."""
+    return unicodedata.category(letter) in ("Cc", "Cf", "Cs")
 
 
 class TableError(ValueError):
@@ -21,24 +47,29 @@ class TableError(ValueError):
         line: int | str | None = None,
         column: str | None = None,
     ):
-        self.file, self.line, self.column = str(file), line, column
-        self.found, self.expected = found, expected
+        self.file, self.line = tell(str(file)), line
+        self.column = None if column is None else tell(column, MOST_FOUND)
+        self.found = tell(found, MOST_FOUND)
+        self.expected = tell(expected, MOST_EXPECTED)
         place = [self.file]
         if line is not None:
             place.append(line if isinstance(line, str) else f"line {line}")
         if column is not None:
-            place.append(f"column {column}")
-        super().__init__(f"{', '.join(place)}: found {found}; expected {expected}")
+            place.append(f"column {self.column}")
+        super().__init__(
+            f"{', '.join(place)}: found {self.found}; expected {self.expected}"
+        )
 
 
 @dataclass(frozen=True)
 class Columns:
     """The columns of a kind of table, in any order and any case; `short`: other names
-    of some."""
+    of some; `texts`: those that hold names, where the others hold numbers."""
 
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
     short: Mapping[str, str] = field(default_factory=dict)
+    texts: tuple[str, ...] = ("pair", "point")
 
     def __str__(self) -> str:
         short = f" (or {','.join(self.short)})" if self.short else ""
@@ -53,7 +84,10 @@ class Columns:
     def places(self, header: list[str], file: str, line: int | None) -> dict[str, int]:
         """The place of every column by its full name. Raises TableError."""
         if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-            expected = "fields separated by commas, decimals by points"
+            expected = (
+                "fields separated by commas, decimals by points; or --semicolons where "
+                "fields are separated by semicolons"
+            )
             raise TableError(
                 file, line=line, found=f"the header {header[0]!r}", expected=expected
             )
@@ -121,11 +155,15 @@ def read_text(path: Path) -> str:
 
 
 def lines_of(
-    text: Iterable[str], file: str, columns: Columns
+    text: Iterable[str], file: str, columns: Columns, semicolons: bool = False
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """(line number, fields by the full names of their columns) of every line that is
-    not blank. Raises TableError."""
-    rows = _rows(text, file)
+    not blank. Raises TableError.
+
+    `semicolons`: they separate the fields, and decimals may be written with a comma,
+    which becomes a point.
+    """
+    rows = _rows(text, file, ";" if semicolons else ",")
     line, header = next(rows, (1, None))
     if header is None:
         raise TableError(
@@ -147,13 +185,23 @@ def lines_of(
             )
         if len(row) > len(places):
             expected = (
-                f"{len(places)}, as in the header; decimals are written with a point, "
-                "names with commas in quotes"
+                f"{len(places)}, as in the header; names that hold a separator stand "
+                "in quotes, decimals are written with a point (or --semicolons)"
             )
             raise TableError(
                 file, line=line, found=f"{len(row)} fields", expected=expected
             )
-        yield line, {name: row[place].strip() for name, place in places.items()}
+        cells = {name: row[place].strip() for name, place in places.items()}
+        if semicolons:
+            for column in cells.keys() - columns.texts:
+                cells[column] = _with_point(cells[column])
+        yield line, cells
+
+
+def _with_point(number: str) -> str:
+    """A number with its decimal comma made a point; anything else as it is."""
+    is_decimal = DECIMAL_COMMA.fullmatch(number)
+    return number.replace(",", ".") if is_decimal else number
 
 
 def name(text: str, file: str, line: int, column: str) -> str:
@@ -196,16 +244,20 @@ def number(text: str, file: str, line: int, column: str, advice: str = "") -> fl
     return value
 
 
-def _rows(text: Iterable[str], file: str) -> Iterator[tuple[int, list[str]]]:
+def _rows(
+    text: Iterable[str], file: str, separator: str
+) -> Iterator[tuple[int, list[str]]]:
     """(line number, fields) of every line that is not blank."""
-    reader = csv.reader(text, strict=True, skipinitialspace=True)
+    reader = csv.reader(text, delimiter=separator, strict=True, skipinitialspace=True)
     while True:
         try:
             row = next(reader)
         except StopIteration:
             return
         except csv.Error as error:
-            expected = "comma-separated fields, each quotation closed on its line"
+            expected = (
+                "fields with separators between them, each quotation closed on its line"
+            )
             raise TableError(
                 file, line=reader.line_num, found=str(error), expected=expected
             ) from None

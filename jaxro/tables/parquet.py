@@ -28,6 +28,9 @@ except ModuleNotFoundError:
 
 NAMES = ("pair", "point")
 
+DAMAGED = OSError, pa.ArrowException, UnicodeDecodeError
+"""What Arrow raises for a file that is damaged."""
+
 BATCH = 1 << 18
 """Rows decoded at once."""
 
@@ -46,14 +49,17 @@ class Scan(NamedTuple):
 
 
 class Source:
-    """A Parquet table of measured points. Raises TableError where it is none."""
+    """A Parquet table of measured points. Raises TableError where it is none.
 
-    def __init__(self, path: Path, told: Path | None = None):
-        self.path = told or path  # as it is told of: a CSV table has been converted
+    `told`: the CSV table of which it is made, with `semicolons` or without.
+    """
+
+    def __init__(self, path: Path, told: Path | None = None, semicolons: bool = False):
+        self.path, self._own, self._semicolons = told or path, path, semicolons
         self._converted = self.path != path
         try:
             self._file = pq.ParquetFile(path, pre_buffer=False)
-        except (OSError, pa.ArrowInvalid) as error:
+        except DAMAGED as error:
             found = f"no Parquet file that can be read ({str(error).splitlines()[0]})"
             raise TableError(
                 path, found=found, expected="a Parquet table of measured points"
@@ -81,51 +87,54 @@ class Source:
                 found="no points",
                 expected="one row for every measured point",
             )
-        for name in NAMES:
-            self._complete(name)
+        self._check_points()
         if "pair" not in self.columns:
             return Scan(np.array([0, self.count]), pa.chunked_array([[self.path.stem]]))
         begins, names, row, last = [], [], 0, None
         for batch in self._file.iter_batches(BATCH, columns=[self.columns["pair"]]):
             column = batch.column(0)
+            if column.null_count:
+                self._check_names(column, "pair", np.arange(row, row + len(column)))
             starts = _runs(column, last)
             begins.append(starts + row)
             names.append(column.take(starts))
             row, last = row + len(column), column[-1].as_py()
         found = np.concatenate(begins)
         every = pa.chunked_array(names)
+        self._check_names(every.combine_chunks(), "pair", found)
         self._once(every, found)
         return Scan(np.append(found, row), every)
 
-    def _complete(self, full: str) -> None:
-        """Raises TableError for a row without a name; reads the column only where the
-        file does not tell."""
-        if full not in self.columns:
+    def _check_points(self) -> None:
+        """Raises TableError for a point without a name."""
+        # by their codes, which are quick to look through. The statistics of the file
+        # would be quicker, but Arrow ends the process where they are damaged
+        name, row = self.columns["point"], 0
+        file = pq.ParquetFile(self._own, pre_buffer=False, read_dictionary=[name])
+        for batch in file.iter_batches(BATCH, columns=[name]):
+            self._check_names(
+                batch.column(0), "point", np.arange(row, row + len(batch))
+            )
+            row += len(batch)
+
+    def _check_names(self, column: Any, full: str, rows: np.ndarray) -> None:
+        """Raises TableError where a name, of these rows, is missing or blank."""
+        codes = column
+        if not pa.types.is_dictionary(column.type):
+            codes = column.dictionary_encode()
+        trimmed = pc.utf8_trim_whitespace(codes.dictionary.cast(pa.string()))  # pyright: ignore[reportAttributeAccessIssue]
+        blank = pc.equal(trimmed, "")  # pyright: ignore[reportAttributeAccessIssue]
+        if not (codes.null_count or blank.null_count or pc.any(blank).as_py()):  # pyright: ignore[reportAttributeAccessIssue]
             return
-        known, place = (
-            self._file.metadata,
-            self._file.schema_arrow.get_field_index(self.columns[full]),
-        )
-        groups = [
-            known.row_group(k).column(place).statistics
-            for k in range(known.num_row_groups)
-        ]
-        if all(map(_has_names, groups)):
-            return
-        row = 0
-        for batch in self._file.iter_batches(BATCH, columns=[self.columns[full]]):
-            names = batch.column(0).cast(pa.string())
-            trimmed = pc.utf8_trim_whitespace(names)  # pyright: ignore[reportAttributeAccessIssue]
-            blank = pc.equal(trimmed, "").fill_null(True)  # pyright: ignore[reportAttributeAccessIssue]
-            if pc.any(blank).as_py():  # pyright: ignore[reportAttributeAccessIssue]
-                row += int(np.flatnonzero(blank.to_numpy(zero_copy_only=False))[0])
-                raise TableError(
-                    self.path,
-                    column=full,
-                    found=f"nothing in {self.place(row)}",
-                    expected=f"the name of the {full}",
-                )
-            row += len(blank)
+        unnamed = blank.take(codes.indices).fill_null(True)
+        places = np.flatnonzero(unnamed.to_numpy(zero_copy_only=False))
+        if len(places):
+            raise TableError(
+                self.path,
+                column=full,
+                found=f"nothing in {self.place(int(rows[places[0]]))}",
+                expected=f"the name of the {full}",
+            )
 
     def _once(self, names: Any, begins: np.ndarray) -> None:
         if len(names.unique()) == len(names):
@@ -148,7 +157,7 @@ class Source:
         """How a row is told of: by its line where the table has been converted."""
         if not self._converted:
             return f"row {row + 1}"
-        line, *_ = next(islice(tables.lines(self.path), row, None))
+        line, *_ = next(islice(tables.lines(self.path, self._semicolons), row, None))
         return f"line {line}"
 
     def read(self, begins: np.ndarray) -> Table:
@@ -198,19 +207,6 @@ class Source:
             piece = next(self._batches)
             self._left = piece.slice(skip) if skip < len(piece) else None
             skip -= min(skip, len(piece))
-
-
-def _has_names(told: Any) -> bool:
-    """Whether the statistics of a column say that no value is missing and no text
-    begins with a blank."""
-    if (
-        told is None
-        or not told.has_null_count
-        or told.null_count
-        or not told.has_min_max
-    ):
-        return False
-    return not isinstance(told.min, str) or told.min[:1] > " "
 
 
 def _columns(path: Path, schema: Any) -> dict[str, str]:

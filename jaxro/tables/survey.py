@@ -25,9 +25,11 @@ from .survey_checks import Row, check_legs, check_reading, check_scale
 
 TEXTS = ("point", "square", "traverse", "from", "to")
 POSITIVE = ("side", "photo_side")
-READINGS = Columns(("point", "square", "parallax"), ("grid", "x", "y", "height"))
-GRID = Columns(("square", "side", "photo_side"), ("parallax", "height"))
-TRAVERSES = Columns(("traverse", "from", "to", "back", "fore"))
+READINGS = Columns(
+    ("point", "square", "parallax"), ("grid", "x", "y", "height"), texts=TEXTS
+)
+GRID = Columns(("square", "side", "photo_side"), ("parallax", "height"), texts=TEXTS)
+TRAVERSES = Columns(("traverse", "from", "to", "back", "fore"), texts=TEXTS)
 LONGEST = 1e9
 """mm: no length is longer, and none shorter than its inverse."""
 
@@ -46,10 +48,12 @@ class Named:
     places: np.ndarray | None
 
 
-def rows(text: str, file: str, columns: Columns) -> list[Row]:
-    """The lines of CSV text by the names of its columns. Raises TableError."""
+def rows(text: str, file: str, columns: Columns, semicolons: bool = False) -> list[Row]:
+    """The lines of CSV text by the names of its columns; `semicolons` as in
+    `fields.lines_of`. Raises TableError."""
     found, line = [], 1
-    for line, entries in fields.lines_of(io.StringIO(text, newline=""), file, columns):
+    given = io.StringIO(text, newline="")
+    for line, entries in fields.lines_of(given, file, columns, semicolons):
         row = Row(file, line, {})
         for column, entry in entries.items():
             row.cells[column] = _cell(entry, row, column, column in columns.optional)
@@ -74,9 +78,9 @@ def _cell(entry: str, row: Row, column: str, optional: bool) -> Any:
     return value
 
 
-def read(path: Path, columns: Columns) -> list[Row]:
+def read(path: Path, columns: Columns, semicolons: bool = False) -> list[Row]:
     """The lines of a file. Raises TableError."""
-    return rows(fields.read_text(path), str(path), columns)
+    return rows(fields.read_text(path), str(path), columns, semicolons)
 
 
 def assemble(
