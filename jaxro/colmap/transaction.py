@@ -7,9 +7,10 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from urllib.parse import quote
 
 from ..tables.fields import TableError
-from ..tables.whole import check_file
+from ..tables.whole import Inputs, check_file, claim
 from .database import Database
 
 WAIT = 1.0
@@ -33,22 +34,30 @@ def open_database(file: Path, out: Path | None, force: bool) -> Iterator[Databas
         ):
             yield database
         return
-    check_file(out, force)
+    with claim(out, check_file, force), _copy(file, out) as database:
+        yield database
+
+
+@contextmanager
+def _copy(file: Path, out: Path) -> Iterator[Database]:
+    """A copy of the database, which takes its name when the block ends without an
+    error. Raises TableError."""
     draft = out.absolute().with_name(f".{out.name}.{os.getpid()}.partial")
+    inputs = Inputs(file)
     try:
-        with _explain_errors(file, out):
-            draft.parent.mkdir(parents=True, exist_ok=True)
-            with closing(_connect(draft)) as connection:
-                # a draft that is not finished is thrown away: it needs no journal, and
-                # the disk waits until it is
-                connection.execute("PRAGMA journal_mode = MEMORY")
-                connection.execute("PRAGMA synchronous = OFF")
-                with _explain_errors(file), closing(_connect(file)) as source:
-                    # waits for a lock for a while, a backup would wait for ever
-                    source.execute("SELECT count(*) FROM sqlite_master")
-                    source.backup(connection)
-                with _transaction(connection, file, force) as database:
-                    yield database
+        with _explain_errors(file, out), closing(_connect(draft)) as connection:
+            # a draft that is not finished is thrown away: it needs no journal, and
+            # the disk waits until it is
+            connection.execute("PRAGMA journal_mode = MEMORY")
+            connection.execute("PRAGMA synchronous = OFF")
+            with _explain_errors(file), closing(_connect_to_read(file)) as source:
+                # waits for a lock for a while, a backup would wait for ever
+                source.execute("SELECT count(*) FROM sqlite_master")
+                source.backup(connection)
+            inputs.check()
+            # whatever geometries there are, the original keeps them
+            with _transaction(connection, file, force=True) as database:
+                yield database
         with _explain_errors(out):
             with draft.open("r+b") as finished:
                 os.fsync(finished.fileno())
@@ -60,7 +69,26 @@ def open_database(file: Path, out: Path | None, force: bool) -> Iterator[Databas
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    return sqlite3.connect(path, timeout=WAIT, isolation_level=None)
+    connection = sqlite3.connect(path, timeout=WAIT, isolation_level=None)
+    connection.text_factory = _text
+    return connection
+
+
+def _connect_to_read(path: Path) -> sqlite3.Connection:
+    """A connection by which nothing is written, no file beside the database either."""
+    with path.open("rb") as file:
+        has_log = file.read(20)[18:] == b"\2\2"
+    # to read a database with a log SQLite makes two files beside it, unless another
+    # process has made them, or nothing is said to change meanwhile
+    alone = has_log and not path.with_name(f"{path.name}-wal").exists()
+    unchanging = "&immutable=1" if alone else ""
+    where = f"file:{quote(str(path.absolute()))}?mode=ro{unchanging}"
+    return sqlite3.connect(where, timeout=WAIT, isolation_level=None, uri=True)
+
+
+def _text(name: bytes) -> str:
+    """A name, in whatever encoding it was written."""
+    return name.decode(errors="replace")
 
 
 @contextmanager

@@ -20,29 +20,30 @@ def run(options: Options, name: str, changes: list[str]) -> bool:
     """Read, clean, orient, write, show. True if every pair is cleaned and usable.
     Raises TableError."""
     procedure = change(find_procedure(name), changes)
-    job = jobs.prepare(options, SIMULATED, procedure)
-    check_sigma(name, procedure, job.task.sigma_known)
     console, errors = consoles()
-    jobs.warn(errors, job)
-    with progress(errors, "Cleaning", len(job.table.names)) as told:
-        results, verdicts = jobs.solve_table(job, told)
-    assert verdicts is not None
-    texts: dict[str, str] = {}
-    if options.out is not None:
-        summary = job.summary(results)
-        heading = {
-            "program": summary["program"],
-            "file": summary["file"],
-            "procedure": name,
-            **sigma.entry(job.noise),
-            "tolerances": tolerances(procedure),
-        }
-        texts = decisions.texts(verdicts, job.units, heading)
-        texts |= files.texts(results, summary)
+    with jobs.writing(options) as write:
+        job = jobs.prepare(options, SIMULATED, procedure)
+        check_sigma(name, procedure, job.task.sigma_known)
+        jobs.warn(errors, job)
+        with progress(errors, "Cleaning", len(job.table.names)) as told:
+            results, verdicts = jobs.solve_table(job, told)
+        assert verdicts is not None
+        written = ""
+        if options.out is not None:
+            summary = job.summary(results)
+            heading = {
+                "program": summary["program"],
+                "file": summary["file"],
+                "procedure": name,
+                **sigma.entry(job.noise),
+                "tolerances": tolerances(procedure),
+            }
+            texts = decisions.texts(verdicts, job.units, heading)
+            written = write(texts | files.texts(results, summary))
     jobs.show_sigma(console, job)
     report.show(console, verdicts, name, job.units.photo)
     jobs.show(console, job, results)
-    jobs.write(console, job, texts)
+    console.print(written, end="", markup=False)
     if options.file is None:
         console.print(
             "This was a simulated example. Your own pairs: jaxro clean FILE.csv "

@@ -29,30 +29,29 @@ class Options:
     deviations: list[str]
     out: Path | None
     force: bool
+    semicolons: bool = False
 
 
 def run(options: Options) -> bool:
     """Read, calculate, show, write. True unless a traverse is suspicious. Raises
     TableError, with nothing written."""
-    if options.out is not None:
-        whole.check_target(options.out, options.force)
-    named = prepare(options)
     console, errors = consoles()
-    done = calculate(named)
+    read = (options.file, options.grid, options.traverses)
     title = "the simulated plot" if options.file is None else str(options.file)
+    inputs, texts, why = whole.Inputs(*read), {}, ""
+    with whole.claim(options.out, whole.check_target, options.force):
+        done = calculate(prepare(options))
+        if options.out is not None:
+            picture, why = drawn(done, title)
+            texts: dict[str, Any] = contents(done) | picture
+            inputs.check()
+            whole.write(options.out, texts, read)
     report.show(console, done, title)
-    texts: dict[str, Any] = {}
-    if options.out is not None:
-        texts = contents(done)
-        picture, why = drawn(done, title)
-        texts |= picture
-        whole.write(options.out, texts, (options.file, options.grid, options.traverses))
-        if why:
-            errors.print(
-                f"Warning: no picture of the surface: {why}",
-                style="yellow",
-                markup=False,
-            )
+    if why:
+        errors.print(
+            f"Warning: no picture of the surface: {why}", style="yellow", markup=False
+        )
+    if texts:
         console.print(f"Written to {options.out}: {', '.join(texts)}", markup=False)
     if options.file is None:
         console.print(
@@ -105,15 +104,12 @@ def prepare(options: Options) -> Named:
             ("--base", options.base),
         )
     )
-    readings, grid = (
-        tables.read(options.file, tables.READINGS),
-        tables.read(options.grid, tables.GRID),
-    )
-    traverses = (
-        None
-        if options.traverses is None
-        else tables.read(options.traverses, tables.TRAVERSES)
-    )
+    semicolons = options.semicolons
+    readings = tables.read(options.file, tables.READINGS, semicolons)
+    grid = tables.read(options.grid, tables.GRID, semicolons)
+    traverses = None
+    if options.traverses is not None:
+        traverses = tables.read(options.traverses, tables.TRAVERSES, semicolons)
     return tables.assemble(readings, grid, traverses, camera_height, base, deviations)
 
 
@@ -179,8 +175,16 @@ def drawn(done: Done, title: str) -> tuple[dict[str, bytes], str]:
                 value,
                 deviation,
                 done.named.names[:n],
+                _legs(done),
                 f"Heights of {title}",
             )
         }, ""
     except ModuleNotFoundError:
         return {}, "it needs matplotlib: pip install 'jaxro[plots]'"
+
+
+def _legs(done: Done) -> np.ndarray:
+    """The first and the last point of every leg between points that have a place."""
+    survey = done.named.survey
+    both = np.stack([np.asarray(survey.start), np.asarray(survey.end)])
+    return both[:, np.all(both < done.named.points, axis=0)]

@@ -5,11 +5,13 @@
         elements/part-00000.parquet, residuals/..., points/...
     DIR/                  the same folder, renamed at the end
 
-The files of a part are complete before its line in the journal is, so that a run that
-was stopped at any moment goes on with the first part that has no line, and ends in the
-same bytes.
+The files of a part are complete and on the disk before its line in the journal is, so
+that a run that was stopped at any moment goes on with the first part that has no line,
+and ends in the same bytes. Every line tells its own SHA-256 and those of its files:
+what has been damaged is made anew.
 """
 
+import hashlib
 import json
 import os
 import re
@@ -23,7 +25,7 @@ from typing import Any
 from ..reports.files import json_text
 from ..tables import whole
 from ..tables.fields import TableError
-from .stream import CONVERTED, Part, Work, Worker, part_file
+from .stream import CONVERTED, Part, Work, Worker, file_digest, part_file
 
 JOURNAL = "journal.jsonl"
 
@@ -36,9 +38,15 @@ class Job:
     """A table of any size, what is to be done with it, and how far it is."""
 
     def __init__(
-        self, work: Work, parts: list[Part], target: Path, request: dict[str, Any]
+        self,
+        work: Work,
+        parts: list[Part],
+        target: Path,
+        request: dict[str, Any],
+        inputs: whole.Inputs,
     ):
         self.work, self.parts, self.target, self.request = work, parts, target, request
+        self._inputs = inputs
         self.entries: list[dict[str, Any]] = []
 
     @property
@@ -60,8 +68,7 @@ class Job:
     @property
     def has_journal(self) -> bool:
         """Whether there is a journal that says what was asked for."""
-        path = self.work.folder / JOURNAL
-        return path.exists() and any(True for _ in _whole_lines(path))
+        return _has_lines(self.work.folder / JOURNAL)
 
     def begin(self) -> None:
         """A new journal. Raises TableError where the folder cannot be written."""
@@ -73,8 +80,7 @@ class Job:
         """What an earlier run finished. Raises TableError where it was asked for
         something else."""
         path = self.work.folder / JOURNAL
-        lines = list(_whole_lines(path))
-        before = lines[0].get("request", {})
+        before, *entries = _read(path)
         for key in sorted(set(before) | set(self.request)):
             if before.get(key) != self.request.get(key):
                 found = (
@@ -87,16 +93,21 @@ class Job:
                     found=found,
                     expected="the same table and options, or a new --out",
                 )
-        self.entries = [entry for entry in lines[1:] if self._stands(entry)]
-        self._rewrite()  # without a line that was cut off
+        finished = {e["part"]: e for e in entries if self._stands(e)}
+        self.entries = list(finished.values())
+        self._rewrite()  # without lines that cannot be believed
 
     def add(self, entry: dict[str, Any]) -> None:
-        """A part is written: its line in the journal."""
+        """A part is written: its line in the journal. Raises TableError where the input
+        is not any more what it was."""
+        self._inputs.check()
         _append(self.work.folder / JOURNAL, entry)
         self.entries.append(entry)
 
     def end(self) -> dict[str, Any]:
-        """The summary, when every part is finished; the folder takes its name."""
+        """The summary, when every part is finished; the folder takes its name. Raises
+        TableError where the input is not any more what it was."""
+        self._inputs.check()
         told = self._totals()
         asked = {key: value for key, value in self.request.items() if key != MODIFIED}
         sigma0 = self.work.units.sigma0 or None
@@ -146,44 +157,64 @@ class Job:
 
     def _stands(self, entry: dict[str, Any]) -> bool:
         """Whether the files of a finished part are what they were."""
-        for name, size in entry["files"].items():
+        for name, digest in entry["files"].items():
             path = part_file(self.work.folder, name, entry["part"])
-            if not (path.exists() and path.stat().st_size == size):
+            if not path.exists() or file_digest(path) != digest:
                 return False
         return True
 
 
 def _append(path: Path, *entries: dict[str, Any]) -> None:
     with path.open("a", encoding="utf-8") as file:
-        file.writelines(json.dumps(entry) + "\n" for entry in entries)
+        file.writelines(_line(entry) for entry in entries)
         file.flush()
         os.fsync(file.fileno())
 
 
-def _whole_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The lines of a journal up to one that was cut off."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError:
+DIGEST = re.compile(rb'(.*), "sha256": "([0-9a-f]{64})"}', re.DOTALL)
+"""The digest at the end of a line, of all that stands before it."""
+
+
+def _line(entry: dict[str, Any]) -> str:
+    """An entry as a line that tells its own digest."""
+    text = json.dumps(entry)[:-1]
+    return f'{text}, "sha256": "{hashlib.sha256(text.encode()).hexdigest()}"}}\n'
+
+
+def _entry(line: bytes) -> dict[str, Any] | None:
+    """The entry of a line, None where it is cut off or another than was written."""
+    found = DIGEST.fullmatch(line)
+    if found is None or hashlib.sha256(found[1]).hexdigest() != found[2].decode():
+        return None
+    return json.loads(found[1] + b"}")
+
+
+def _has_lines(path: Path) -> bool:
+    """Whether a journal is there, and more than a first line that was cut off."""
+    return path.exists() and b"\n" in path.read_bytes()
+
+
+def _read(path: Path) -> Iterator[dict[str, Any]]:
+    """The request, and then the entries that can be believed. Raises TableError where
+    the request cannot."""
+    with whole.telling(path, "the --out of a run that was stopped, to resume it"):
+        lines = path.read_bytes().split(b"\n")
+    first, *others = map(_entry, lines)
+    if first is None or "request" not in first:
         raise TableError(
             path,
-            found="no journal",
-            expected="the --out of a run that was stopped, to resume it",
-        ) from None
-    for line in text.splitlines(keepends=True):
-        try:
-            entry = json.loads(line) if line.endswith("\n") else None
-        except json.JSONDecodeError:
-            entry = None
-        if not isinstance(entry, dict):
-            return
-        yield entry
+            line=1,
+            found="another line than was written there",
+            expected="the journal of a run that was stopped; --force begins anew",
+        )
+    yield first["request"]
+    yield from (entry for entry in others if entry is not None)
 
 
 def previous_request(folder: Path) -> dict[str, Any]:
     """What the run in this folder was asked for; nothing where it has no journal."""
-    lines = _whole_lines(folder / JOURNAL) if (folder / JOURNAL).exists() else iter(())
-    return next(lines, {}).get("request", {})
+    path = folder / JOURNAL
+    return next(_read(path)) if _has_lines(path) else {}
 
 
 def here(job: Job, told: Callable[[int], None]) -> Iterable[dict[str, Any]]:

@@ -73,29 +73,43 @@ def run(
     finished parts can be resumed."""
     started = time.monotonic()
     console, errors = consoles()
-    job = prepare(options, large, procedure)
     told = "Cleaning" if procedure else "Orienting"
-    try:
+    with whole.claim(options.out, check_folder_name, options.force):
+        job = prepare(options, large, procedure)
         with progress(errors, told, job.pairs) as tell:
-            tell(job.done)
-            for entry in large.engine(job, tell):
-                job.add(entry)
+            summary = _work(job, large, tell, options.force)
+    show(console, job, summary, time.monotonic() - started)
+    return good(summary)
+
+
+def check_folder_name(folder: Path, force: bool) -> None:
+    """Raises TableError for a name that no folder can have."""
+    whole.check_name(folder, "a name for the folder of results")
+
+
+def _work(
+    job: Job, large: Large, tell: Callable[[int], None], force: bool
+) -> dict[str, Any]:
+    """All parts that are left, and the summary. Raises TableError."""
+    try:
+        tell(job.done)
+        for entry in large.engine(job, tell):
+            job.add(entry)
         # what may have appeared there meanwhile
-        _check_place(job.target, options.force)
-        summary = job.end()
-    except (OSError, parquet.pa.ArrowException) as error:
+        _check_place(job.target, force)
+        return job.end()
+    except parquet.DAMAGED as error:
         raise _refusal(
             job.work.file, job.work.folder, error, "; what is finished --resume keeps"
         ) from None
     except KeyboardInterrupt:
+        _, errors = consoles()
         errors.print(
             f"{len(job.entries)} of {len(job.parts)} parts are finished; --resume goes "
             "on",
             markup=False,
         )
         raise
-    show(console, job, summary, time.monotonic() - started)
-    return good(summary)
 
 
 def good(summary: dict[str, Any]) -> bool:
@@ -116,7 +130,7 @@ def prepare(
             expected="a table and --out DIR where results are Parquet tables",
         )
     chosen = _tables(large.tables)
-    whole.check_name(options.out, "a name for the folder of results")
+    check_folder_name(options.out, options.force)
     out = options.out.resolve()
     folder = out.with_name(f"{out.name}.unfinished")
     if large.resume and not folder.exists() and (out / JOURNAL).exists():
@@ -135,7 +149,7 @@ def prepare(
             shutil.rmtree(folder, ignore_errors=True)
         if stopped is not None:
             os.replace(stopped, folder)
-        if isinstance(error, OSError | parquet.pa.ArrowException):
+        if isinstance(error, parquet.DAMAGED):
             raise _refusal(options.file, folder, error) from None
         raise
     if stopped is not None:
@@ -173,13 +187,19 @@ def _plan(
 ) -> Job:
     """The job that is asked for; a CSV table is converted first."""
     assert options.file is not None and options.out is not None
+    inputs = whole.Inputs(options.file, options.camera)
     source = options.file
-    if not whole.is_parquet(source):
+    if whole.is_parquet(source):
+        if options.semicolons:
+            raise TableError(
+                "--semicolons", found="it with a Parquet table", expected="a CSV table"
+            )
+    else:
         source = folder / CONVERTED
         if not (large.resume and source.exists() and (folder / JOURNAL).exists()):
             folder.mkdir(parents=True, exist_ok=True)
-            convert(options.file, source)
-    table = parquet.Source(source, options.file)
+            convert(options.file, source, options.semicolons)
+    table = parquet.Source(source, options.file, options.semicolons)
     system = SYSTEMS[options.elements or "relative"]
     check_numbers(options, table.has_sigma, str(options.file), system)
     known = table.has_sigma or options.sigma is not None
@@ -222,7 +242,8 @@ def _plan(
         task=task,
         units=units_of(options, table.has_sigma, system),
     )
-    return Job(work, pieces, options.out.resolve(), asked | deviation.entry(noise))
+    asked |= deviation.entry(noise)
+    return Job(work, pieces, options.out.resolve(), asked, inputs)
 
 
 def _sample(table: parquet.Source, scan: parquet.Scan, cameras: Cameras) -> Ragged:
@@ -308,6 +329,7 @@ def _request(
         "elements",
         "base",
         "residual",
+        "semicolons",
     }
     asked |= {name: _plain(getattr(options, name)) for name in sorted(named | {"unit"})}
     asked["elements"] = options.elements or "relative"

@@ -1,6 +1,8 @@
 """One call of `jaxro orient` with CSV results, from its options to its reports, and what
 `jaxro clean` shares with it: a whole table at once."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -78,15 +80,13 @@ def prepare(
     otherwise: Example = MEASURED,
     procedure: AbstractProcedure | None = None,
 ) -> Job:
-    """Everything read and checked, the target of --out as well; `otherwise`: the table
-    where no file is named. Raises TableError."""
-    if options.out is not None:
-        whole.check_target(options.out, options.force)
+    """Everything read and checked; `otherwise`: the table where no file is named.
+    Raises TableError."""
     system = SYSTEMS[options.elements or ("relative" if options.file else "dependent")]
     if options.file is None:
         table = tables.parse(otherwise.table, otherwise.name, otherwise.name)
     else:
-        table = tables.read(options.file)
+        table = tables.read(options.file, options.semicolons)
     known = read_cameras(options, otherwise)
     check_numbers(options, table.has_sigma, table.file, system)
     sigma_known = table.has_sigma or options.sigma is not None
@@ -153,17 +153,18 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
 def run(options: Options) -> bool:
     """Read, orient, show, write. True if every pair is usable. Raises TableError, with
     nothing written."""
-    job = prepare(options)
     console, errors = consoles()
-    warn(errors, job)
-    with progress(errors, "Orienting", len(job.table.names)) as told:
-        results, _ = solve_table(job, told)
-    texts = {}
-    if options.out is not None:
-        texts = files.texts(results, job.summary(results))
+    with writing(options) as write:
+        job = prepare(options)
+        warn(errors, job)
+        with progress(errors, "Orienting", len(job.table.names)) as told:
+            results, _ = solve_table(job, told)
+        written = ""
+        if options.out is not None:
+            written = write(files.texts(results, job.summary(results)))
     show_sigma(console, job)
     show(console, job, results)
-    write(console, job, texts)
+    console.print(written, end="", markup=False)
     if options.file is None:
         console.print(
             "This was the embedded example. Your own pairs: jaxro orient FILE.csv "
@@ -179,12 +180,22 @@ def warn(errors: Console, job: Job) -> None:
         errors.print(f"Warning: {warning}", style="yellow", markup=False)
 
 
-def write(console: Console, job: Job, texts: dict[str, str]) -> None:
-    """The files of --out, if it was asked for, and where they are. Raises
-    TableError."""
-    if job.options.out is not None:
-        whole.write(job.options.out, texts, (job.options.file, job.options.camera))
-        console.print(f"Written to {job.options.out}: {', '.join(texts)}", markup=False)
+@contextmanager
+def writing(options: Options) -> Iterator[Callable[[dict[str, str]], str]]:
+    """Within the block --out is written to by this process alone, by the function that
+    it gets: the files by name, and where they are as a line. Raises TableError, then
+    nothing is written, also where the input is not any more what it was."""
+    read = (options.file, options.camera)
+    inputs = whole.Inputs(*read)
+
+    def write(texts: dict[str, str]) -> str:
+        assert options.out is not None
+        inputs.check()
+        whole.write(options.out, texts, read)
+        return f"Written to {options.out}: {', '.join(texts)}\n"
+
+    with whole.claim(options.out, whole.check_target, options.force):
+        yield write
 
 
 def show_sigma(console: Console, job: Job) -> None:

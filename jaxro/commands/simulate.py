@@ -85,10 +85,34 @@ def run_comparison(options: Options, wanted: Wanted) -> bool:
             found=repr(wanted.false_alarms),
             expected="a share: 0, or less than 1",
         )
-    if wanted.out is not None:
-        whole.check_file(wanted.out, wanted.force)
     console, warnings = consoles()
-    layouts = layouts_of(options, warnings)
+    inputs = whole.Inputs(options.file, options.camera)
+    with whole.claim(wanted.out, whole.check_file, wanted.force):
+        layouts = layouts_of(options, warnings)
+        _check_errors(errors, layouts)
+        with progress(warnings, "Comparing", None) as told:
+            found = compare(
+                layouts,
+                procedures,
+                errors=errors,
+                sizes=sizes,
+                trials=wanted.trials,
+                seed=wanted.seed,
+                false_alarms=wanted.false_alarms,
+                progress=told,
+            )
+        if wanted.out is not None:
+            inputs.check()
+            whole.write_file(wanted.out, files.csv_text(rows(found)))
+    for part in tables(found):
+        console.print(part, markup=False)
+    if wanted.out is not None:
+        console.print(f"Written to {wanted.out}", markup=False)
+    return True
+
+
+def _check_errors(errors: list[int], layouts: dict[str, Pair]) -> None:
+    """Raises TableError where so many wrong points leave too few good ones."""
     most = max(int(exact.count) for exact in layouts.values())
     if max(errors) > most - LEAST:
         expected = (
@@ -96,23 +120,6 @@ def run_comparison(options: Options, wanted: Wanted) -> bool:
             "left"
         )
         raise TableError("--errors", found=str(max(errors)), expected=expected)
-    with progress(warnings, "Comparing", None) as told:
-        found = compare(
-            layouts,
-            procedures,
-            errors=errors,
-            sizes=sizes,
-            trials=wanted.trials,
-            seed=wanted.seed,
-            false_alarms=wanted.false_alarms,
-            progress=told,
-        )
-    for part in tables(found):
-        console.print(part, markup=False)
-    if wanted.out is not None:
-        whole.write_file(wanted.out, files.csv_text(rows(found)))
-        console.print(f"Written to {wanted.out}", markup=False)
-    return True
 
 
 def layouts_of(options: Options, warnings: Any) -> dict[str, Pair]:
@@ -163,6 +170,7 @@ def _standard(options: Options) -> dict[str, Pair]:
         ("--principal-point", options.principal_point),
         ("--pixel-size", options.pixel_size),
         ("--y-down", options.y_down or None),
+        ("--semicolons", options.semicolons or None),
         ("--unit", None if options.unit == "mm" else options.unit),
     ):
         if value is not None:

@@ -2,6 +2,7 @@
 by part. A part is a number of whole pairs.
 """
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -85,18 +86,25 @@ class Worker:
             "files": self._write(part.number, written),
         }
 
-    def _write(self, number: int, tables: dict[str, Any]) -> dict[str, int]:
-        """The sizes of the files of a part, each of them whole or not there at all."""
+    def _write(self, number: int, tables: dict[str, Any]) -> dict[str, str]:
+        """The digests of the files of a part, each of them whole or not there at
+        all."""
 
-        def write(name: str) -> int:
+        def write(name: str) -> str:
             path = part_file(self._work.folder, name, number)
             path.parent.mkdir(exist_ok=True)
             with whole.draft_of(path) as draft:
                 parquet.write(arrow_table(*tables[name], self._work.units), draft)
-            return path.stat().st_size
+                return file_digest(draft)
 
         with ThreadPoolExecutor(len(tables)) as pool:
             return dict(zip(tables, pool.map(write, tables), strict=True))
+
+
+def file_digest(path: Path) -> str:
+    """The SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def part_file(folder: Path, table: str, number: int) -> Path:

@@ -1,10 +1,13 @@
-"""Whole files or none: where a result may be written, and writing it there."""
+"""Whole files or none: where a result may be written, by one process at a time, and
+writing it there; and whether what was read is still what it was."""
 
 import os
+import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from .fields import TableError
 
@@ -12,6 +15,101 @@ from .fields import TableError
 def is_parquet(file: Path) -> bool:
     """Whether the name of a file says that it is a Parquet table."""
     return file.suffix.lower() in (".parquet", ".pq")
+
+
+class Inputs:
+    """Files that are read, as they were when the reading began."""
+
+    def __init__(self, *files: Path | None):
+        self._before = {file: _state(file) for file in files if file is not None}
+
+    def check(self) -> None:
+        """Raises TableError where one of them is not what it was."""
+        for file, before in self._before.items():
+            if _state(file) != before:
+                raise TableError(
+                    file,
+                    found="another content than at the beginning",
+                    expected="a file that nothing else writes to meanwhile; begin anew",
+                )
+
+
+def _state(file: Path) -> tuple[int, ...]:
+    """What changes with the content of a file; nothing of a file that is not there."""
+    try:
+        now = file.stat()
+    except OSError:
+        return ()
+    return now.st_dev, now.st_ino, now.st_size, now.st_mtime_ns
+
+
+@contextmanager
+def claim(
+    target: Path | None, check: Callable[[Path, bool], None], force: bool
+) -> Iterator[None]:
+    """Within the block no other process writes to `target`, a folder or a file, nothing
+    where it is None.
+
+    `check`: one of the functions below, which says whether a result may be written
+    there. Raises TableError where it may not, or where another process writes to it.
+    What a process that was killed had not finished is removed.
+    """
+    if target is None:
+        yield
+        return
+    check(target, force)
+    path = target.resolve()
+    made = _make_parents(path, target)
+    try:
+        lock = _lock(path, target)
+        try:
+            check(target, force)  # what another process may have finished meanwhile
+            _remove_drafts(path)
+            yield
+        finally:
+            # as long as it is held: who waits for it then sees that it is gone
+            with suppress(OSError):
+                os.unlink(lock.lock_file)
+            lock.release()
+    finally:
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()  # where nothing was written
+
+
+def _lock(path: Path, target: Path) -> Any:
+    """A lock beside `path` that this process holds. Raises TableError, which names
+    `target`, where another one does."""
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=0)
+    with telling(target, "a place that can be written"):
+        try:
+            lock.acquire()
+        except Timeout:
+            raise TableError(
+                target,
+                found="another process that writes there",
+                expected="another --out, or to wait until it has finished",
+            ) from None
+    return lock
+
+
+def _make_parents(path: Path, target: Path) -> list[Path]:
+    """Make the folders above a path; those that were not there, the innermost first.
+    Raises TableError, which names `target`."""
+    missing = [folder for folder in path.parents if not folder.exists()]
+    with telling(target, "a place that can be written"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def _remove_drafts(path: Path) -> None:
+    """Remove what was begun by processes that do not live any more."""
+    draft = re.compile(rf"\.{re.escape(path.name)}\.\d+\.partial(-\w+)?")
+    for entry in list(path.parent.iterdir()):
+        if draft.fullmatch(entry.name):
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
 
 
 def check_target(directory: Path, force: bool) -> None:
@@ -67,11 +165,13 @@ def telling(path: Path, expected: str) -> Iterator[None]:
 @contextmanager
 def draft_of(path: Path, draft: Path | None = None) -> Iterator[Path]:
     """A file to write, beside `path` if not given, which takes the place of `path` when
-    it is complete. Of an error nothing is left."""
+    all of it is on the disk. Of an error nothing is left."""
     draft = draft or path.with_suffix(".partial")
     draft.unlink(missing_ok=True)
     try:
         yield draft
+        with draft.open("r+b") as written:
+            os.fsync(written.fileno())
         os.replace(draft, path)
     finally:
         with suppress(OSError):
