@@ -1,25 +1,135 @@
 """Where reports and warnings go, and the bar that shows how far a long calculation
 is."""
 
+import codecs
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import NoReturn
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, NoReturn, TextIO
 
 from rich.console import Console
+from rich.segment import Segment
 
+from ..tables.fields import tell
 from ..xla import store
+
+PLAIN = str.maketrans(
+    {
+        "σ": "s",
+        "µ": "u",
+        "±": "+-",
+        "°": " deg",
+        "²": "^2",
+        "χ": "chi",
+        "…": "...",
+        "–": "-",
+        "−": "-",
+        "×": "x",
+        "≤": "<=",
+        "≥": ">=",
+    }
+)
+"""Letters of the reports where a terminal has not got them."""
+
+
+class Steady:
+    """A stream that may be closed, or full, while a report is written: that is
+    remembered as `error`, and what is calculated is not lost with it."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+        self.error: OSError | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """As of the stream."""
+        with self._remember():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """As of the stream."""
+        with self._remember():
+            self._stream.flush()
+
+    @contextmanager
+    def _remember(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self.error = self.error or error
+            # what is left in buffers goes nowhere, also at the end of the process
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)
+
+
+class _Console(Console):
+    """A console that shows no control characters of names."""
+
+    def render(self, *arguments: Any, **options: Any) -> Iterable[Segment]:
+        for segment in super().render(*arguments, **options):
+            if segment.control:
+                yield segment
+            else:
+                lines = segment.text.split("\n")
+                yield segment._replace(text="\n".join(map(tell, lines)))
 
 
 def consoles() -> tuple[Console, Console]:
     """(for reports, for warnings and progress)."""
     # text that goes to a file or a pipe is not wrapped at 80 columns
-    wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200
-    return Console(width=wide, highlight=False, emoji=False), Console(
-        stderr=True, highlight=False, emoji=False
+    looked_at = sys.stdout is not None and sys.stdout.isatty()
+    wide = None if looked_at or "COLUMNS" in os.environ else 200
+    return (
+        _Console(width=wide, highlight=False, emoji=False),
+        _Console(stderr=True, highlight=False, emoji=False),
     )
+
+
+@contextmanager
+def steady_streams() -> Iterator[Callable[[], OSError | None]]:
+    """Standard output and error that never stop the work; the error of standard output
+    by a call."""
+    codecs.register_error("plain", _plain_letters)
+    before = sys.stdout, sys.stderr
+    steady = [_steady(stream) for stream in before]
+    sys.stdout, sys.stderr = steady
+
+    def flush() -> OSError | None:
+        out = steady[0]
+        if out is None:
+            return None
+        out.flush()
+        return out.error
+
+    try:
+        yield flush
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+def _steady(stream: Any) -> Any:
+    """The stream, None where the process has none."""
+    if stream is None:
+        return None
+    if hasattr(stream, "reconfigure"):
+        stream.reconfigure(errors="plain")
+    return Steady(stream)
+
+
+def _plain_letters(error: UnicodeError) -> tuple[str, int]:
+    """What is written for letters that the encoding of a stream has not got."""
+    assert isinstance(error, UnicodeEncodeError)
+    letters = error.object[error.start : error.end].translate(PLAIN)
+    known = (
+        letters if letters.isascii() else letters.encode("ascii", "replace").decode()
+    )
+    return known, error.end
 
 
 def abort() -> NoReturn:
@@ -30,8 +140,11 @@ def abort() -> NoReturn:
     goes on in a thread of its own and reads it: the process died of a segmentation
     fault.
     """
-    sys.stdout.flush()
-    print("Aborted.", file=sys.stderr, flush=True)
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, AttributeError):
+            if stream is sys.stderr:
+                print("Aborted.", file=stream)
+            stream.flush()
     os._exit(130)
 
 
@@ -47,7 +160,7 @@ def say_compiling(shape: tuple[int, ...]) -> Iterator[None]:
     of = f"{pairs[0]} pairs of up to " if pairs and pairs[0] > 1 else ""
     once = ", once on this machine" if store.active() else ""
     line = f"Compiling for {of}{points} points{once} ..."
-    if not sys.stderr.isatty():
+    if sys.stderr is None or not sys.stderr.isatty():
         yield
         return
     say = lambda: print(line, file=sys.stderr, flush=True)

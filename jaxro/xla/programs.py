@@ -6,6 +6,7 @@ off by `settings.plain` is part of every key.
 """
 
 import gc
+import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import lru_cache, wraps
@@ -39,6 +40,19 @@ def watch(surround: Watch) -> None:
     """Let `surround` be around every compilation from now on, to say what is awaited."""
     global _watch
     _watch = surround
+
+
+_used = _forked = False
+
+
+def _mark_child() -> None:
+    """Remember that this process is a copy of one that has used JAX."""
+    global _forked
+    _forked = _used
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_mark_child)
 
 
 class _Key:
@@ -80,6 +94,7 @@ class Program:
         self._plain = switched_off()
 
     def __call__(self, data: PyTree) -> PyTree:
+        _refuse_fork()
         if is_traced((data, self._arrays)):
             # compiled as a part of the caller's program, or, under a `grad` or `vmap`
             # that nobody compiles, by itself and once
@@ -195,6 +210,19 @@ def pause_collection() -> Iterator[None]:
     finally:
         if collects:
             gc.enable()
+
+
+def _refuse_fork() -> None:
+    """Raises RuntimeError in a process that was forked from one that has used JAX,
+    whose threads do not live on in it: it would wait for them for ever."""
+    global _used
+    _used = True
+    if _forked:
+        raise RuntimeError(
+            "this process was forked from one that has already computed with jaxro, "
+            "whose threads it has not got. Start processes anew: "
+            "multiprocessing.get_context('spawn'), or fork before the first call"
+        )
 
 
 @lru_cache(maxsize=64)

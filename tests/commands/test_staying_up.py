@@ -1,0 +1,278 @@
+"""What happens to a command that works: a terminal that closes, another process in the
+same folder, input that changes, a fork, damaged parts."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from filelock import FileLock
+from typer.testing import CliRunner
+
+from jaxro.cli import app
+from jaxro.commands import large, orient
+from jaxro.commands.ending import NOT_SHOWN
+from jaxro.commands.journal import JOURNAL
+from jaxro.commands.request import Options
+from jaxro.tables import whole
+from jaxro.tables.examples import pair as example
+from jaxro.tables.fields import TableError
+from jaxro.xla import settings
+
+FOCAL = ["--focal", str(example.FOCAL)]
+COMMAND = [sys.executable, "-m", "jaxro"]
+FILES = {
+    "elements.csv",
+    "residuals.csv",
+    "points.csv",
+    "reliability.csv",
+    "summary.json",
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def settings_of_users():
+    """Other processes compile as users do: so does this one, to end in the same
+    bytes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(settings.COMPILE_FAST, "xla_backend_optimization_level", 1)
+        yield
+
+
+@pytest.fixture
+def table(tmp_path):
+    path = tmp_path / "in" / "pair.csv"
+    path.parent.mkdir()
+    path.write_text(example.TABLE)
+    return path
+
+
+def run(*arguments):
+    return CliRunner().invoke(
+        app, ["orient", *map(str, arguments)], env={"COLUMNS": "200"}
+    )
+
+
+def names(folder: Path) -> set[str]:
+    return {entry.name for entry in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("stream", "code"),
+    [("> /dev/full", NOT_SHOWN), ("| true", 0), (">&-", 0), (">&- 2>&-", 0)],
+)
+def test_a_broken_standard_output_costs_no_results(stream, code, table, tmp_path):
+    out = tmp_path / "out"
+    line = f'"{sys.executable}" -m jaxro orient {table} --focal {example.FOCAL}'
+    # pipefail: the exit code of jaxro, not that of who reads it
+    shell = ["bash", "-c", f"set -o pipefail; {line} --out {out} {stream}"]
+    done = subprocess.run(shell, capture_output=True, text=True)
+    assert done.returncode == code
+    assert names(out) == FILES
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+    if code:
+        assert "files of --out are written" in done.stderr
+
+
+def test_letters_that_a_terminal_has_not_got_are_written_in_others(table):
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    arguments = [*COMMAND, "orient", table, *FOCAL, "--elements", "dependent"]
+    done = subprocess.run(arguments, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "+- sd" in done.stdout and "?" not in done.stdout
+
+
+def test_control_characters_of_names_are_not_shown(tmp_path):
+    path = tmp_path / "names.csv"
+    lines = example.TABLE.splitlines()
+    column = lines[0].split(",").index("point")
+    fields = lines[1].split(",")
+    fields[column] = "evil\x1b]0;title\x07\u202ename"
+    path.write_text("\n".join([lines[0], ",".join(fields), *lines[2:]]))
+    done = run(path, *FOCAL)
+    assert done.exit_code == 0
+    assert "evil" in done.output
+    assert not set(done.output) & {"\x1b", "\x07", "\u202e"}
+    path.write_text(f"\x1b[31m{'x' * 100_000}\npoint\n")
+    done = run(path, *FOCAL)
+    assert done.exit_code == 2 and "\x1b" not in done.output
+    assert len(done.output) < 1000
+
+
+def test_two_processes_do_not_write_into_one_folder(table, tmp_path):
+    """The second is refused at once, and nothing of it is left."""
+    out = tmp_path / "new" / "out"
+    out.parent.mkdir()
+    with FileLock(out.parent / ".out.lock"):
+        for more in ([], ["--parquet"]):
+            found = run(table, *FOCAL, "--out", out, *more)
+            assert found.exit_code == 2
+            assert "another process that writes there" in found.output
+    assert not out.exists()
+    os.remove(out.parent / ".out.lock")
+    stale = out.parent / ".out.123.partial"
+    stale.mkdir()
+    (stale / "elements.csv").write_text("begun by a process that was killed")
+    neighbour = out.parent / ".out.b.123.partial"
+    neighbour.mkdir()
+    assert run(table, *FOCAL, "--out", out).exit_code == 0
+    assert names(out) == FILES
+    assert names(out.parent) == {"out", neighbour.name}
+
+
+def test_two_processes_at_once(table, tmp_path):
+    out = tmp_path / "out"
+    line = [*COMMAND, "orient", table, *FOCAL, "--out", out]
+    both = [subprocess.Popen(line, stderr=subprocess.DEVNULL) for _ in range(2)]
+    assert sorted(process.wait() for process in both) == [0, 2]
+    assert names(out) == FILES and names(tmp_path) == {"in", "out"}
+
+
+def test_of_a_refused_call_no_folder_is_left(table, tmp_path):
+    found = run(table, "--focal", "-1", "--out", tmp_path / "a" / "b" / "out")
+    assert found.exit_code == 2
+    assert names(tmp_path) == {"in"}
+
+
+@pytest.mark.parametrize("parquet", [False, True])
+def test_input_that_changes_meanwhile_is_noticed(parquet, table, tmp_path, monkeypatch):
+    if parquet:
+        place, name = large.Job, "add"
+    else:
+        place, name = orient, "solve_table"
+    before = getattr(place, name)
+
+    def change(*arguments):
+        table.write_text(example.TABLE + "\n")
+        return before(*arguments)
+
+    monkeypatch.setattr(place, name, change)
+    more = ["--parquet"] if parquet else []
+    found = run(table, *FOCAL, "--out", tmp_path / "out", *more)
+    assert found.exit_code == 2
+    assert "another content than at the beginning" in found.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_damaged_parts_are_made_anew(tmp_path, monkeypatch):
+    """Whatever byte of a finished part or of the journal is another one: the results
+    are the same."""
+    pytest.importorskip("pyarrow")
+    header, *points = example.TABLE.splitlines()
+    source = tmp_path / "pairs.csv"
+    rows = [f"p{k},{line}" for k in range(4) for line in points]
+    source.write_text("\n".join([f"pair,{header}", *rows]))
+    options = Options(file=source, focal=example.FOCAL, out=tmp_path / "out")
+
+    def work(resume, out):
+        wanted = large.Large(resume=resume, part_rows=len(points), tables="elements")
+        return large.run(Options(file=source, focal=example.FOCAL, out=out), wanted)
+
+    assert work(False, tmp_path / "whole")
+    expected = {
+        path.name: path.read_bytes() for path in (tmp_path / "whole").rglob("*.*")
+    }
+
+    def stop(job):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(large.Job, "end", stop)
+        with pytest.raises(KeyboardInterrupt):
+            work(False, options.out)
+    unfinished = tmp_path / "out.unfinished"
+    kept = {
+        path: path.read_bytes() for path in unfinished.rglob("*.*") if path.is_file()
+    }
+    part = unfinished / "elements" / "part-00001.parquet"
+    journal = unfinished / JOURNAL
+    second_line = kept[journal].index(b"\n") + 20
+    size = len(kept[part])
+    damages = [(part, at) for at in (0, 5, size // 2, size - 1)]
+    damages += [(journal, second_line + 30 * k) for k in range(4)]
+    for path, at in damages:
+        for file, content in kept.items():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content)
+        content = bytearray(kept[path])
+        content[at] ^= 1
+        path.write_bytes(content)
+        assert work(True, options.out)
+        found = {path.name: path.read_bytes() for path in options.out.rglob("*.*")}
+        assert found == expected
+        os.rename(options.out, tmp_path / f"done{at}{path.name}")
+
+    unfinished.mkdir(exist_ok=True)
+    for content in (
+        b"\xff\xfe\n",
+        b"[" * 100_000 + b"\n",
+        b"{}\n",
+        b'{"request": 1}\n',
+    ):
+        journal.write_bytes(content)
+        with pytest.raises(TableError, match="journal of a run that was stopped"):
+            work(True, options.out)
+
+
+def test_what_was_read_is_compared_with_what_it_was(tmp_path):
+    file = tmp_path / "a.csv"
+    file.write_text("a")
+    inputs = whole.Inputs(file, None)
+    inputs.check()
+    file.write_text("ab")
+    with pytest.raises(TableError, match="another content"):
+        inputs.check()
+    file.unlink()
+    with pytest.raises(TableError, match="another content"):
+        inputs.check()
+
+
+FORKED = """
+import os, sys, warnings
+warnings.simplefilter("ignore")
+import numpy as np
+import jaxro
+from jaxro.geometry.mock_pairs import mock_pair, standard_layout
+pair = mock_pair(standard_layout(8))
+print(bool(jaxro.orient(pair).usable), flush=True)
+child = os.fork()
+if child == 0:
+    try:
+        jaxro.orient(pair)
+    except RuntimeError as error:
+        print("forked" in str(error), flush=True)
+        os._exit(0)
+    os._exit(1)
+assert os.waitpid(child, 0)[1] == 0
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="only where processes fork")
+def test_a_fork_after_the_first_call_is_told(tmp_path):
+    line = [sys.executable, "-c", FORKED]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
+    assert done.stdout.split() == ["True", "True"], done.stderr
+
+
+def test_semicolons_and_decimal_commas(table, tmp_path):
+    spread = tmp_path / "spread.csv"
+    header, *points = example.TABLE.strip().splitlines()
+    lines = [header.replace(",", ";")]
+    lines += [line.replace(",", ";").replace(".", ",") for line in points]
+    spread.write_text("\n".join(lines))
+    refused = run(spread, *FOCAL)
+    assert refused.exit_code == 2 and "--semicolons" in refused.output
+    for more in ([], ["--parquet"]):
+        outs = [tmp_path / f"{name}{len(more)}" for name in ("comma", "semicolon")]
+        assert run(table, *FOCAL, "--out", outs[0], *more).exit_code == 0
+        arguments = (spread, *FOCAL, "--out", outs[1], *more, "--semicolons")
+        assert run(*arguments).exit_code == 0
+        if more:
+            summaries = [json.loads((out / "summary.json").read_text()) for out in outs]
+            assert summaries[0]["results"] == summaries[1]["results"]
+            assert [s["semicolons"] for s in summaries] == [False, True]
+        else:
+            texts = [(out / "points.csv").read_text() for out in outs]
+            assert texts[0].replace("\npair,", "\nspread,") == texts[1]
