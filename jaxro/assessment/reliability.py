@@ -216,6 +216,7 @@ def assess(
     orientation: Orientation,
     *,
     sigma0: ArrayLike | None = None,
+    sigma: float | None = None,
     level: float = 0.001,
     power: float = 0.80,
     familywise: bool = False,
@@ -226,16 +227,20 @@ def assess(
     true standard deviations; the standard deviation of a coordinate if the pair has
     unit sigma; None if it is not known: the estimated one then takes its place,
     detectable errors are those of the t test, and nothing is testable with less than
-    two degrees of freedom. `level` of the test of each point, or (`familywise`) of all
+    two degrees of freedom. `sigma`: in its place the standard deviation of all
+    coordinates, as `--sigma` of the command line, of a pair that was made without one.
+    `level` of the test of each point, or (`familywise`) of all
     together by Šidák; `power` with which detectable errors are found. In a pair whose
     orientation is not usable nothing is testable. Works under jit and vmap. Raises
-    ValueError for a batch without vmap.
+    ValueError for a batch without vmap, and for a second standard deviation.
     """
     if pair.x_left.ndim != 1:
         raise ValueError(
             "assess takes one pair, but the coordinates have shape "
             f"{pair.x_left.shape}: use jax.vmap"
         )
+    if sigma is not None:
+        sigma0 = _unit_of(pair, sigma0, sigma)
     sigma0 = None if sigma0 is None else jnp.asarray(sigma0, pair.x_left.dtype)
     options = {
         "sigma0": sigma0,
@@ -248,6 +253,19 @@ def assess(
     return Program(_assess, options, settings_for(pair.x_left.size))(
         (pair, orientation)
     )
+
+
+def _unit_of(pair: Pair, sigma0: ArrayLike | None, sigma: float) -> float:
+    """The standard deviation of unit weight where all coordinates have this one. Raises
+    ValueError where another is told."""
+    own = not is_traced(pair.sigma) and np.any(np.asarray(pair.sigma) != 1)
+    if sigma0 is not None or own:
+        told = "the pair has its own" if own else "sigma0 is given too"
+        raise ValueError(
+            f"assess: sigma is that of the coordinates of a pair made without one, but "
+            f"{told}; leave out one of the two"
+        )
+    return sigma
 
 
 def _assess(

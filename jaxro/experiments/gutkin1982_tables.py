@@ -29,7 +29,7 @@ def tables(results: Results) -> "list[str | Table]":
         "with the dp that belongs to h, -2.2 mm for H = 1500 and B max, where the "
         "paper keeps -0.8.",
         "Numbers of the text",
-        _figures(results),
+        *_figures(results),
         "(5) and (6) are printed without p_c2 - p_c1 in the denominator: at the "
         "paper's extremes (p_c = 17.5 and "
         "17.6 mm, dp = -2 mm) a difference is then 0.7 % too large.",
@@ -48,45 +48,59 @@ def tables(results: Results) -> "list[str | Table]":
 
 
 def _case(results: Results, case: int) -> "list[str | Table]":
-    given, marks = CASES[case], []
+    """The heights, then the differences, and what is wrong in the print."""
+    marks: list[str] = []
+    both = [_columns(results, case, begin, marks) for begin in (0, 2)]
+    return [*both, *_notes(marks)]
+
+
+def _columns(results: Results, case: int, begin: int, marks: list[str]) -> "Table":
+    """Two columns of the paper, which a narrow terminal has room for."""
+    given = CASES[case]
+    some = slice(begin, begin + 2)
     rows = table(
         f"H = {given.camera_height:g} mm",
-        *chain.from_iterable((c, "paper", "diff.") for c in COLUMNS),
+        *chain.from_iterable((c, "paper", "diff.") for c in COLUMNS[some]),
     )
     for row in ROWS:
         digits, cells = (3 if row == "m_pc" else 1), []
-        for column, (found, printed) in enumerate(
-            zip(results.cells[case, row], given.printed[row], strict=True)
-        ):
-            why = MISPRINTS.get((case, row, column))
-            if why and why not in marks:
-                marks.append(why)
-            mark = f" [{marks.index(why) + 1}]" if why else ""
+        both = zip(results.cells[case, row], given.printed[row], strict=True)
+        for column, (found, printed) in list(enumerate(both))[some]:
+            mark = _mark(MISPRINTS.get((case, row, column), ""), marks)
             cells += [
                 number(found, digits + 1),
                 f"{printed:.{digits}f}{mark}",
                 number(found - printed, digits + 1),
             ]
         rows.add_row(row, *cells)
-    rows.add_row(
-        "exact",
-        *chain.from_iterable((number(v, 2), "", "") for v in results.exact[case]),
-    )
-    return [rows, *(f"  [{i}] {why}" for i, why in enumerate(marks, 1))]
+    exact = ((number(v, 2), "", "") for v in results.exact[case][some])
+    rows.add_row("exact", *chain.from_iterable(exact))
+    return rows
 
 
-def _figures(results: Results) -> "Table":
-    rows = table("", "calculated", "paper", "diff.", "remark")
-    rows.columns[-1].justify = "left"
+def _mark(why: str, marks: list[str]) -> str:
+    """The number of a note, which is one of `marks` from now on."""
+    if not why:
+        return ""
+    if why not in marks:
+        marks.append(why)
+    return f" [{marks.index(why) + 1}]"
+
+
+def _notes(marks: list[str]) -> list[str]:
+    return [f"  [{i}] {why}" for i, why in enumerate(marks, 1)]
+
+
+def _figures(results: Results) -> "list[str | Table]":
+    rows, marks = table("", "calculated", "paper", "diff."), []
     for f in results.figures:
         rows.add_row(
             f.what,
             number(f.found, f.digits),
-            f"{f.printed:g}",
+            f"{f.printed:g}{_mark(f.remark, marks)}",
             number(f.found - f.printed, f.digits),
-            f.remark,
         )
-    return rows
+    return [rows, *_notes(marks)]
 
 
 def _experiment(results: Results) -> "Table":

@@ -147,6 +147,20 @@ def test_external_studentisation_is_the_adjustment_without_the_point():
         np.testing.assert_allclose(abs(float(reading.t[point])), expected, rtol=1e-3)
 
 
+def test_sigma_is_the_standard_deviation_of_all_coordinates():
+    """As on the command line, for a pair that was made without one."""
+    one = measured(sigma=0.01)
+    orientation = oriented(one)
+    by_sigma = assess(one, orientation, sigma=0.01)
+    by_unit = assess(one, orientation, sigma0=0.01)
+    np.testing.assert_array_equal(by_sigma.w, by_unit.w)
+    with pytest.raises(ValueError, match="sigma0 is given too"):
+        assess(one, orientation, sigma=0.01, sigma0=0.01)
+    own = one.with_sigma(0.01)
+    with pytest.raises(ValueError, match="the pair has its own"):
+        assess(own, oriented(own), sigma=0.01)
+
+
 @pytest.mark.parametrize("points", [6, 7, 9, 16])
 def test_redundancy_numbers_add_up(points):
     one = measured(mock_pairs.standard_layout(points), sigma=0.01)

@@ -463,3 +463,14 @@ def test_the_rates_of_1989_with_the_tolerance_that_fits():
         "II-9"
     ][0] == [7]
     assert "21" in words(run("reproduce", "burshtynskaya1989", "--trials", 34).stdout)
+
+
+def test_tables_of_1982_have_room_on_a_narrow_terminal():
+    typer = pytest.importorskip("typer.testing")
+    from jaxro.cli import app
+
+    done = typer.CliRunner().invoke(
+        app, ["reproduce", "gutkin1982"], env={"COLUMNS": "80"}
+    )
+    assert done.exit_code == 0 and "\u2026" not in done.output
+    assert max(map(len, done.output.splitlines())) <= 80
