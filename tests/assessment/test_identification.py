@@ -199,7 +199,8 @@ def test_of_eight_points_no_good_one_is_rejected_alone(trials):
 
 @pytest.mark.slow
 def test_sixteen_points_are_decided():
-    for size, today in ((6.0, 0.385), (8.0, 0.787), (12.0, 0.994)):
+    """Shares of 8192 pairs, measured on the layout of 1989 with rows at .9 and .6."""
+    for size, today in ((6.0, 0.383), (8.0, 0.776), (12.0, 0.993)):
         _, out, doubted, wrong, _ = cleaned(16, size, 8192)
         right = np.all(out == wrong, axis=1) & ~np.any(doubted, axis=1)
         assert np.mean(right) > today - 0.005, (size, np.mean(right))
