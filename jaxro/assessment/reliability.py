@@ -229,10 +229,10 @@ def assess(
     detectable errors are those of the t test, and nothing is testable with less than
     two degrees of freedom. `sigma`: in its place the standard deviation of all
     coordinates, as `--sigma` of the command line, of a pair that was made without one.
-    `level` of the test of each point, or (`familywise`) of all
-    together by Šidák; `power` with which detectable errors are found. In a pair whose
-    orientation is not usable nothing is testable. Works under jit and vmap. Raises
-    ValueError for a batch without vmap, and for a second standard deviation.
+    `level` of the test of each point, or (`familywise`) of all together by Šidák;
+    `power` with which detectable errors are found. In a pair whose orientation is not
+    usable nothing is testable. Works under jit and vmap. Raises ValueError for a batch
+    without vmap, and for a second standard deviation.
     """
     if pair.x_left.ndim != 1:
         raise ValueError(

@@ -93,13 +93,9 @@ class Database:
         self, table: str, row: str | None, column: str | None, found: str, expected: str
     ) -> TableError:
         """What is wrong, and where."""
-        place = ", ".join(
-            [
-                str(self.file),
-                f"table {table}",
-                *([tell(row, LONGEST_ROW)] if row else []),
-            ]
-        )
+        place = f"{self.file}, table {table}"
+        if row:
+            place += f", {tell(row, LONGEST_ROW)}"
         return TableError(place, found=found, expected=expected, column=column)
 
     def _whole(self, table: str, row: str, column: str, value: object) -> None:
@@ -225,7 +221,6 @@ class Database:
         for number in pair_ids:
             rows, cols, data = self._connection.execute(query, (number,)).fetchone()
             row = f"pair_id {number}"
-            self._whole("matches", row, "rows", rows)
             if rows and cols != 2:
                 expected = "2, the places of a keypoint in either image"
                 raise self.error("matches", row, "cols", str(cols), expected)

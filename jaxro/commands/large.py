@@ -130,7 +130,6 @@ def prepare(
             expected="a table and --out DIR where results are Parquet tables",
         )
     chosen = _tables(large.tables)
-    check_folder_name(options.out, options.force)
     out = options.out.resolve()
     folder = out.with_name(f"{out.name}.unfinished")
     if large.resume and not folder.exists() and (out / JOURNAL).exists():

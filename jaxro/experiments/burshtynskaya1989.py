@@ -15,6 +15,8 @@ The paper does not give its tolerances either. The first stage is the algorithm 
 with eps4 = 0.01 mm as there, and with 0.045 mm. The figure of the layout is lost, too.
 With rows at 1, .9, .6, .1 every eps4 from .0405 to .0464 mm rejects just the points
 that the text describes for all three pairs; with rows at 1, .85, .7, .1 no eps4 does.
+The rates that the paper prints are not reproduced with it: 48 % of the errors found by
+residual parallaxes, 45 % by Grubbs' test, 7 % missed; calculated are 60, 35 and 5 %.
 """
 
 from collections.abc import Callable, Iterable

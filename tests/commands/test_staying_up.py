@@ -16,29 +16,14 @@ from jaxro.commands import large, orient
 from jaxro.commands.ending import NOT_SHOWN
 from jaxro.commands.journal import JOURNAL
 from jaxro.commands.request import Options
+from jaxro.reports.columns import TABLES
 from jaxro.tables import whole
 from jaxro.tables.examples import pair as example
 from jaxro.tables.fields import TableError
-from jaxro.xla import settings
 
 FOCAL = ["--focal", str(example.FOCAL)]
 COMMAND = [sys.executable, "-m", "jaxro"]
-FILES = {
-    "elements.csv",
-    "residuals.csv",
-    "points.csv",
-    "reliability.csv",
-    "summary.json",
-}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def settings_of_users():
-    """Other processes compile as users do: so does this one, to end in the same
-    bytes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(settings.COMPILE_FAST, "xla_backend_optimization_level", 1)
-        yield
+FILES = {f"{name}.csv" for name in TABLES} | {"summary.json"}
 
 
 @pytest.fixture
