@@ -230,7 +230,8 @@ def latencies(calls: int) -> dict[str, float]:
     near = partial(orient_near, problem=Problem())
     ways: dict[str, Callable] = {
         "compiled function, pose": jit_in_this_thread(
-            one_kernel(lambda pair: near(pair)[0].pose), known_settings(COMPILE_FASTEST)
+            one_kernel(lambda pair: near(pair)[0][0].pose),
+            known_settings(COMPILE_FASTEST),
         ),
         "compiled function, whole Orientation": jit_in_this_thread(
             one_kernel(near), known_settings(COMPILE_FASTEST)

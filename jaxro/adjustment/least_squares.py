@@ -119,12 +119,10 @@ def _adjust_few(
     start = as_parameters(jax.lax.stop_gradient(start))
     called_with = (as_given(start),) if term.prepare is None else start.arguments()
     residuals = Residuals(close(term, *called_with), start, loss)
-    dtype = jax.tree.leaves(start)[0].dtype
-    origin = (jnp.zeros((), dtype),) * start.count
     solve = lambda origin, residuals: normal.minimise(
         residuals, origin, solver, max_steps
     )
-    solution = kernel_part(solve)(origin, residuals)
+    solution = kernel_part(solve)(start.origin, residuals)
     solved = start.move(solution.value).normalise()
     converged = solution.result == optx.RESULTS.successful
     at_solution = Residuals(residuals.term, solved)
@@ -174,11 +172,11 @@ def read(
     `residuals`."""
     p = residuals.centre.count
     mask = residuals.term.mask
-    origin = (jnp.zeros((), jax.tree.leaves(residuals.centre)[0].dtype),) * p
-    linearise = residuals.linearise(origin)
+    linearise = residuals.linearise(*residuals.slopes())
+    dtype = residuals.centre.origin[0].dtype
     r, jacobian, weight = jax.vmap(linearise)(*residuals.of_groups)
     n, _, squares, number = normal.accumulate(
-        r, jacobian, reweight(loss, r, weight), mask.astype(origin[0].dtype)
+        r, jacobian, reweight(loss, r, weight), mask.astype(dtype)
     )
     q, pivot = normal.inverse(n)
 
@@ -194,7 +192,7 @@ def read(
     checked = freedom > 0
     cofactor = normal.dense(q)
     if loss is None:
-        divisor = jnp.where(checked, freedom, 1).astype(origin[0].dtype)
+        divisor = jnp.where(checked, freedom, 1).astype(dtype)
         sigma0 = root(squares / divisor)
     else:
         entries = jnp.concatenate(white)

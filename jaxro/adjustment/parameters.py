@@ -41,10 +41,24 @@ class AbstractParameters(eqx.Module):
         """What `prepare` is called with."""
         return (self,)
 
-    def slopes(self, function: Callable, x: Step) -> tuple[Any, list[Any]]:
-        """function(*arguments) of the parameters moved by x, and its derivatives along
-        `count` directions there."""
-        return slopes(lambda *x: function(*self.move(x).arguments()), x)
+    @property
+    def origin(self) -> Step:
+        """The step that moves nothing."""
+        dtype = jax.tree.leaves(self)[0].dtype
+        return (jnp.zeros((), dtype),) * self.count
+
+    def moved(self, x: Step) -> "AbstractParameters":
+        """The parameters after a step x, or as they are if x is empty."""
+        return self.move(x) if x else self
+
+    def slopes(
+        self, function: Callable, x: Step = (), *, bilinear: bool = False
+    ) -> tuple[Any, list[Any]]:
+        """function(*arguments) of the parameters moved by x (not moved if x is empty),
+        and its derivatives along `count` directions there. `bilinear`: the function is
+        linear in each of two arguments, so that it is its own derivative."""
+        del bilinear
+        return slopes(lambda *x: function(*self.move(x).arguments()), x or self.origin)
 
     def further(self, x: Step, step: Step) -> Step:
         """The displacement x followed by a step along the directions of `slopes`."""

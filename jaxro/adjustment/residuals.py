@@ -17,7 +17,7 @@ from .terms import Term, discrepancy, whiten
 
 class Residuals(eqx.Module):
     """The whitened residuals of a term as a function of a displacement x of all
-    parameters from `centre`.
+    parameters from `centre`; at the centre itself if x is empty.
 
     θ is what the condition of a group is called with: what `term.prepare` makes of the
     `arguments` of the parameters, or the parameters themselves.
@@ -30,7 +30,7 @@ class Residuals(eqx.Module):
     def shared(self, *x: Array) -> PyTree:
         """θ(x): what `prepare` makes of the parameters, or the parameters
         themselves."""
-        parameters = self.centre.move(x)
+        parameters = self.centre.moved(x)
         if self.term.prepare is None:
             return as_given(parameters)
         return self._prepare(*parameters.arguments())
@@ -69,22 +69,28 @@ class Residuals(eqx.Module):
         return r if self.loss is None else [self.loss.transform(entry) for entry in r]
 
     def __call__(
-        self, x: tuple[Array, ...]
+        self, x: tuple[Array, ...] = ()
     ) -> Float[Array, " group"] | Float[Array, "group m"]:
         return together(self.groups(self.residuals, self.shared(*x)))
 
     def columns(
-        self, x: tuple[Array, ...]
+        self, x: tuple[Array, ...] = ()
     ) -> tuple[list[Array], Sequence[Sequence[Any]], list[Array] | None]:
         """The m residual arrays, for each direction at x the m arrays of its column,
         and the weights of both."""
-        r, columns, weight = jax.vmap(self.linearise(x))(*self.of_groups)
+        r, columns, weight = jax.vmap(self.linearise(*self.slopes(x)))(*self.of_groups)
         return r, columns, reweight(self.loss, r, weight)
 
-    def linearise(self, x: tuple[Array, ...]) -> Callable:
+    def slopes(self, x: tuple[Array, ...] = ()) -> tuple[PyTree, list[PyTree]]:
+        """θ(x) and its derivatives along all directions."""
+        if self.term.prepare is None:
+            return normal.slopes(self.shared, x or self.centre.origin)
+        return self.centre.slopes(self._prepare, x, bilinear=self.term.bilinear)
+
+    def linearise(self, theta: PyTree, along: list[PyTree]) -> Callable:
         """A function of a group's observation, its cofactors and whether it is used:
-        the m residuals at x, for each direction the m entries of its column, and the
-        weights of both but for a loss.
+        the m residuals for θ, for each direction the m entries of its column, and the
+        weights of both but for a loss. `along`: the derivatives of θ.
 
         A single condition stays unwhitened, residual g and weight 1/d, d = B Q Bᵀ: its
         column is √d times that of g/√d, that is ∂g - g ∂d / 2d, and no root is taken;
@@ -92,10 +98,6 @@ class Residuals(eqx.Module):
         are those of iteratively reweighted least squares, which do not overshoot as
         those of the transformed residual may.
         """
-        if self.term.prepare is None:
-            theta, along = normal.slopes(self.shared, x)
-        else:
-            theta, along = self.centre.slopes(self._prepare, x)
 
         def one(observation, cofactor, use):
             at = lambda theta: discrepancy(

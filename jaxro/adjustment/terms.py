@@ -29,7 +29,7 @@ class Term(eqx.Module):
     each of them the family and the member of every group, (group,). Without it the
     condition is called with all parameters. `prepare`: what all groups share, computed
     once from the `arguments` of the parameters; the condition is then called with its
-    result.
+    result. `bilinear`: `prepare` is linear in each of its two arguments.
     """
 
     condition: Callable
@@ -38,6 +38,7 @@ class Term(eqx.Module):
     touches: tuple[tuple[str, Int[Array, " group"]], ...]
     mask: Bool[Array, " group"]
     prepare: Callable | None
+    bilinear: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -48,11 +49,13 @@ class Term(eqx.Module):
         touches: Sequence[tuple[str, Int[ArrayLike, "..."]]] = (),
         mask: ArrayLike | None = None,
         prepare: Callable | None = None,
+        bilinear: bool = False,
     ):
         if touches and prepare is not None:
             raise ValueError("Term: what blocks share cannot be prepared")
         self.condition = condition
         self.prepare = prepare
+        self.bilinear = bilinear
         self.observations = jax.tree.map(jnp.asarray, observations)
         groups = jax.tree.leaves(self.observations)[0].shape[0]
         self.touches = tuple(

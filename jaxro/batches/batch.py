@@ -23,6 +23,7 @@ from ..orientation.orient import orient_near, orient_once
 from ..orientation.problem import Problem, problem_of
 from ..orientation.result import Orientation
 from ..orientation.starts import AbstractStart, Auto
+from ..orientation.verdict import check_plane
 from ..rejection import OUTCOMES, AbstractProcedure, Rejection
 from ..rejection.base import stages
 from ..rejection.hypotheses import AbstractHypotheses
@@ -311,8 +312,8 @@ def _orient_slab_near(
     pairs: Pair, *, problem: Problem, read: Callable, chunk: int
 ) -> tuple[PyTree, Array]:
     def one(pair: Pair):
-        orientation, fits = orient_near(pair, problem)
-        return read(pair, orientation), fits
+        unchecked, fits = orient_near(pair, problem)
+        return read(pair, check_plane(pair, *unchecked)), fits
 
     return map_chunks(one, pairs, chunk)
 

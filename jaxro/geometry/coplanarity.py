@@ -34,7 +34,7 @@ def fundamental_matrix(
     rotation: Matrix, base: Vector, focal_left: Scalar, focal_right: Scalar
 ) -> Matrix:
     """F = diag(1, 1, -f1) E diag(1, 1, -f2), so that g = (x1, y1, 1) F (x2, y2, 1)ᵀ;
-    once for a pair."""
+    once for a pair. It is linear in the rotation and in the base."""
     e = essential(rotation, base)
     return (
         (e[0][0], e[0][1], -focal_right * e[0][2]),
@@ -108,7 +108,12 @@ def rigorous(pair: Pair) -> Term:
         rotation, base, pair.focal_left, pair.focal_right
     )
     return Term(
-        condition, pair.coordinates, pair.sigma**2, mask=pair.mask, prepare=prepare
+        condition,
+        pair.coordinates,
+        pair.sigma**2,
+        mask=pair.mask,
+        prepare=prepare,
+        bilinear=True,
     )
 
 

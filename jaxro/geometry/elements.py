@@ -157,36 +157,37 @@ class RelativePose(AbstractElements):
             ),
         )
 
-    def slopes(self, function: Callable, x: Step) -> tuple[Any, list[Any]]:
+    def slopes(
+        self, function: Callable, x: Step = (), *, bilinear: bool = False
+    ) -> tuple[Any, list[Any]]:
         """The right photo turns about its own axes: R [e_k]x is R with two columns
-        exchanged, one of them negative. The base moves by its stereographic
-        coordinates."""
-        rotation, base = self.move(x).relative()
+        exchanged, one of them negative, and the third zero. The base moves by its
+        stereographic coordinates."""
+        rotation, base = self.moved(x).arguments()
+
+        def along(argument: int, direction: Any) -> Any:
+            at = [rotation, base]
+            if bilinear:
+                at[argument] = direction
+                return function(*at)
+            of_one = lambda value: function(*at[:argument], value, *at[argument + 1 :])
+            return jax.jvp(of_one, (at[argument],), (direction,))[1]
+
         columns = rot.transpose(rotation)
-        along = []
+        nothing = (jnp.zeros_like(base[0]),) * 3
+        slopes = []
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
-
-            def turned(*pair, k=k, i=i, j=j):
-                ordered = {k: columns[k], i: pair[0], j: pair[1]}
-                return function(
-                    rot.transpose((ordered[0], ordered[1], ordered[2])), base
-                )
-
-            back = tuple(-entry for entry in columns[i])
-            along.append(
-                jax.jvp(turned, (columns[i], columns[j]), (columns[j], back))[1]
-            )
+            minus = tuple(-entry for entry in columns[i])
+            turned = {k: nothing, i: columns[j], j: minus}
+            turning = rot.transpose((turned[0], turned[1], turned[2]))
+            slopes.append(along(0, turning))
         first = self.bx, self.by, self.bz
-        for tangent, t in zip(rot.tangents(first), x[3:], strict=True):
-            direction = tuple(
-                q - t / 2 * p for p, q in zip(first, tangent, strict=True)
-            )
-            value, slope = jax.jvp(
-                lambda base: function(rotation, base), (base,), (direction,)
-            )
-            along.append(slope)
-        return value, along
+        for number, tangent in enumerate(rot.tangents(first), 3):
+            # the centre of the projection is half of x away from the base that moved
+            moving = rot.add_scaled(tangent, first, -x[number] / 2) if x else tangent
+            slopes.append(along(1, moving))
+        return function(rotation, base), slopes
 
     def further(self, x: Step, step: Step) -> Step:
         """Of two rotations with halved parameters a and then e those of both are (a + e

@@ -70,11 +70,9 @@ def linearise(pair: Pair, elements: AbstractElements) -> Linear:
     Works under jit, vmap and grad.
     """
     residuals = coplanarity.residuals(pair, elements)
-    (g,), jacobian, weight = residuals.columns((jnp.zeros_like(pair.focal_left),) * 5)
-    assert weight is not None  # there is one condition a point
-    f = coplanarity.fundamental_matrix(
-        *elements.relative(), pair.focal_left, pair.focal_right
-    )
+    f, slopes = residuals.slopes()
+    of_points = jax.vmap(residuals.linearise(f, slopes))
+    (g,), jacobian, weight = of_points(*residuals.of_groups)
     by_coordinates = jax.grad(coplanarity.condition, argnums=1)
     gradient = jax.vmap(lambda point: by_coordinates(f, point))(pair.coordinates)
     used = lambda values: jnp.where(pair.mask, values, 0.0)

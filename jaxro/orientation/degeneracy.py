@@ -164,7 +164,7 @@ def _along_columns(
     of F."""
     focals = pair.focal_left, pair.focal_right
     fundamental = lambda r, b: coplanarity.fundamental_matrix(r, b, *focals)
-    _, slopes = elements.slopes(fundamental, (jnp.zeros_like(pair.focal_left),) * 5)
+    _, slopes = elements.slopes(fundamental, bilinear=True)
     return [inner(by_entry, slope) for slope in slopes]
 
 

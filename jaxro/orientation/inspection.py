@@ -21,17 +21,19 @@ ONE_SIDE = 0.5
 
 
 class Inspection(NamedTuple):
-    """`in_front`: Σ of the signs of both depths, negative where the base points to the
-    wrong side. `distance`: root mean square distance of the points from the condition,
-    to first order, over the left focal length. `spread`: that of the left points from
-    the principal point, over the same. `angle`: root mean square sine of the angle
-    between p1 and R p2, that is without a base; `parallax`: the same in units of the
-    standard deviation of a coordinate seen from the photos, sigma / f. `sigma`: root
-    mean square of the sigmas. `twin`: whether enough of the points lie on one side of
-    what would be the left photo of the second orientation, were they in a plane
-    (`planes`): the sign of w · p1 = 1/(2λ) - b · p1 says it of one point."""
+    """`in_front`: Σ of the signs of both depths, negative where the base points to
+    the wrong side. `behind`: the share of the points that lie behind a photo.
+    `distance`: root mean square distance of the points from the condition, to first
+    order, over the left focal length. `spread`: that of the left points from the
+    principal point, over the same. `angle`: root mean square sine of the angle
+    between p1 and R p2, that is without a base; `parallax`: the same in units of
+    the standard deviation of a coordinate seen from the photos, sigma / f. `sigma`:
+    root mean square of the sigmas. `twin`: whether enough of the points lie on one
+    side of what would be the left photo of the second orientation, were they in a
+    plane (`planes`): the sign of w · p1 = 1/(2λ) - b · p1 says it of one point."""
 
     in_front: Float[Array, ""]
+    behind: Float[Array, ""]
     distance: Float[Array, ""]
     spread: Float[Array, ""]
     angle: Float[Array, ""]
@@ -62,6 +64,7 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
         terms = (
             jnp.ones_like(g),
             left + right,
+            jnp.where(left + right > 1, 0.0, 1.0),
             jnp.where(twin_side > 0, left, -left),
             g * g / square,
             length - pair.focal_left**2,
@@ -72,11 +75,13 @@ def inspect(pair: Pair, pose: RelativePose) -> Inspection:
         return tuple(jnp.where(use, term, 0.0) for term in terms)
 
     of_points = jax.vmap(of_point)(pair.coordinates, pair.sigma, pair.mask)
-    number, in_front, twin, *squares = sums(of_points)
-    mean = lambda square: jnp.sqrt(jnp.maximum(square, 0.0) / jnp.maximum(number, 1.0))
+    number, in_front, behind, twin, *squares = sums(of_points)
+    some = jnp.maximum(number, 1.0)
+    mean = lambda square: jnp.sqrt(jnp.maximum(square, 0.0) / some)
     distance, spread, angle, parallax, sigma = map(mean, squares)
     return Inspection(
         in_front=in_front,
+        behind=behind / some,
         distance=distance / pair.focal_left,
         spread=spread / pair.focal_left,
         angle=angle,

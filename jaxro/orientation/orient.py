@@ -19,8 +19,9 @@ from . import starts
 from .describe import Description, describe
 from .problem import FOR_CALLERS, Problem, as_array
 from .result import Orientation
-from .solve import Solution, solve
-from .verdict import verdict
+from .results import RESULTS
+from .solve import solve
+from .verdict import check_plane, verdict
 
 ANY_LENGTH = (coplanarity.rigorous, coplanarity.parallax)
 """Residuals that may be asked for with more places than points; one of the user's may
@@ -81,14 +82,18 @@ def orient(
             problem = problem._replace(tolerance=FOR_CALLERS)
         return Program(orient_once, {"problem": problem})(pair)
     points = pair.x_left.size
-    if not isinstance(start, starts.Auto):
-        return _run(orient_once, pair, problem, kernels_of_parts).first(points)
-    # two small programs instead of one large: the general start is compiled when a pair
-    # first needs it
-    orientation, fits = _run(orient_near, pair, problem, one_kernel)
-    if not bool(fits):
+    # small programs instead of a large one: the general start, and the check of points
+    # in a plane, are compiled when a pair first needs them
+    fits = False
+    if isinstance(start, starts.Auto):
+        (orientation, asked), fits = _run(orient_near, pair, problem, one_kernel)
         problem = problem.starting(start.general)
-        orientation = _run(orient_once, pair, problem, kernels_of_parts)
+    if not bool(fits):
+        orientation, asked = _run(orient_unchecked, pair, problem, kernels_of_parts)
+    if bool(asked):  # pyright: ignore[reportPossiblyUnboundVariable]
+        pair = pad(pair, orientation.parallax.size)
+        program = Program(_check, {}, settings_for(pair.x_left.size))
+        orientation = program((pair, (orientation, asked)))
     return orientation.first(points)
 
 
@@ -105,17 +110,28 @@ def _run(function: Callable, pair: Pair, problem: Problem, kernel: Callable) -> 
     return program(pair)
 
 
+Unchecked = tuple[Orientation, Bool[Array, ""]]
+"""An orientation, and whether `check_plane` is still to come."""
+
+
+def _check(data: tuple[Pair, Unchecked]) -> Orientation:
+    pair, (orientation, asked) = data
+    return check_plane(pair, orientation, asked)
+
+
 def orient_once(pair: Pair, problem: Problem) -> Orientation:
     """The orientation of one pair, within a compiled program."""
-    pair, bad_input = mask_unusable(pair)
-    solution = solve(pair, problem)
-    description = describe(pair, problem, solution)
-    return _conclude(pair, problem, solution, description, bad_input)
+    return check_plane(pair, *orient_unchecked(pair, problem))
 
 
-def orient_near(pair: Pair, problem: Problem) -> tuple[Orientation, Bool[Array, ""]]:
-    """The first part of an `Auto` start as an orientation of its own: from the
-    vertical, and whether that fits."""
+def orient_unchecked(pair: Pair, problem: Problem) -> Unchecked:
+    """The orientation of one pair but for `check_plane`."""
+    return _solve(pair, problem)[0]
+
+
+def orient_near(pair: Pair, problem: Problem) -> tuple[Unchecked, Bool[Array, ""]]:
+    """The first part of an `Auto` start as an orientation of its own but for
+    `check_plane`: from the vertical, and whether that fits."""
     auto, most = problem.start, problem.most_steps
     assert isinstance(auto, starts.Auto)
     plain = problem.loss is None
@@ -124,26 +140,21 @@ def orient_near(pair: Pair, problem: Problem) -> tuple[Orientation, Bool[Array, 
     vertical = starts.Vertical(steps=int(first_order))
     problem = problem.starting(vertical, max_steps=allowed)
 
-    pair, bad_input = mask_unusable(pair)
-    solution = solve(pair, problem)
-    description = describe(pair, problem, solution)
-    orientation = _conclude(pair, problem, solution, description, bad_input)
+    (orientation, asked), description = _solve(pair, problem)
     # asks for the count, not for the result, which would cost the statistics where only
     # the pose is wanted
     ended = (orientation.iterations < allowed) | (allowed == most)
-    return orientation, auto.fits(description.pose, description.inspection) & ended
+    fits = auto.fits(description.pose, description.inspection) & ended
+    return (orientation, asked), fits
 
 
-def _conclude(
-    pair: Pair,
-    problem: Problem,
-    solution: Solution,
-    description: Description,
-    bad_input: Bool[Array, ""],
-) -> Orientation:
-    """The orientation with its verdict."""
+def _solve(pair: Pair, problem: Problem) -> tuple[Unchecked, Description]:
+    """The orientation but for `check_plane`, and what it was made of."""
+    pair, bad_input = mask_unusable(pair)
+    solution = solve(pair, problem)
+    description = describe(pair, problem, solution)
     adjustment = solution.adjustment
-    return Orientation(
+    orientation = Orientation(
         pose=description.pose,
         elements=description.elements,
         cofactor=description.cofactor,
@@ -158,3 +169,7 @@ def _conclude(
         iterations=adjustment.iterations,
         result=verdict(pair, problem, solution, description, bad_input),
     )
+    fine = orientation.result == RESULTS.successful
+    checked = orientation.degrees_of_freedom > 0
+    asked = description.inspection.twin & fine & checked
+    return (orientation, asked), description

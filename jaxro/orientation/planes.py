@@ -14,7 +14,7 @@ same homography, so that points in the plane cannot tell the two apart (Longuet-
     b' = β w / 2 - n,    β chosen so that det A' = det A,    R' = (A A'⁻¹)ᵀ R.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -58,6 +58,15 @@ class Plane(NamedTuple):
     normal: Float[Array, "3"]
     within: Bool[Array, "point"]
     share: Float[Array, ""]
+
+
+class InverseDepths(NamedTuple):
+    """Of every point the coordinates of p1, the inverse depth n · p1, and its weight |c
+    x b|²."""
+
+    columns: tuple[Array, Array, Array]
+    target: Float[Array, "point"]
+    weight: Float[Array, "point"]
 
 
 class Twin(NamedTuple):
@@ -116,7 +125,7 @@ def poses(pair: Pair, orientation: Oriented, *, limit: float = 4.0) -> PlanePose
         poses=(pose, other),
         normals=(normal, plane(pair, other, pair.mask, unit).normal),
         squares=(squares(pair, pose), squares(pair, other)),
-        behind=(behind(pair, pose), behind(pair, other)),
+        behind=(inspect(pair, pose).behind, inspect(pair, other).behind),
         share=share,
         exists=exists,
     )
@@ -146,10 +155,9 @@ def second_squares(
         needed, _ = state
         # depends on the round, or it would not wait for it
         inside = mask_unusable(pair.with_mask(pair.mask & needed))[0]
-        other, exists = second(
-            inside, pose, plane(inside, pose, inside.mask, jnp.inf).normal
-        )
-        fine = needed & exists & (behind(inside, other) <= BEHIND)
+        normal = nearest_normal(inside, pose, inside.mask)
+        other, exists = second(inside, pose, normal)
+        fine = needed & exists & (inspect(inside, other).behind <= BEHIND)
         return needed & False, jnp.where(fine, squares(inside, other), jnp.inf)
 
     start = (needed, jnp.full_like(pair.focal_left, jnp.inf))
@@ -169,23 +177,38 @@ def plane(
     """The plane nearest to the points in use: n of c x p1 = (c x b) (n · p1), c = R p2,
     linear, in turns in which points off it lose their weight. A point lies in it if the
     homography takes p1 to p2 within `limit` standard deviations."""
-    columns, target, sure = _inverse_depths(pair, pose)
+    depths = _inverse_depths(pair, pose)
     transfer_errors = _transfer_errors(pair, pose)
     square = jnp.asarray(limit, pair.sigma.dtype) ** 2
 
-    def fit(weight):
-        weights = [jnp.where(use, weight, 0.0)]
-        n, h, _ = accumulate([target], [[c] for c in columns], weights)
-        return tuple(solve(n, h))
-
     def turn(_, normal):
         s = transfer_errors(normal) / square
-        return fit(sure / (1 + jnp.minimum(s, 1e6)))
+        return _fit(depths, use, 1 / (1 + jnp.minimum(s, 1e6)))
 
-    normal = lax.fori_loop(0, TURNS, turn, fit(sure))
+    normal = lax.fori_loop(0, TURNS, turn, _fit(depths, use))
     within = use & (transfer_errors(normal) <= square)
-    finite = jnp.stack([jnp.where(jnp.isfinite(c), c, 0.0) for c in normal])
-    return Plane(finite, within, count(within) / jnp.maximum(count(use), 1.0))
+    share = count(within) / jnp.maximum(count(use), 1.0)
+    return Plane(_finite(normal), within, share)
+
+
+def nearest_normal(
+    pair: Pair, pose: RelativePose, use: Bool[Array, "point"]
+) -> Float[Array, "3"]:
+    """The normal of the plane nearest to the points in use, as if all lay in one."""
+    return _finite(_fit(_inverse_depths(pair, pose), use))
+
+
+def _fit(depths: InverseDepths, use: Bool[Array, "point"], factor: ArrayLike = 1.0):
+    """The normal with the inverse depths of the points in use, their weights times a
+    factor."""
+    weights = [jnp.where(use, depths.weight * factor, 0.0)]
+    columns = [[column] for column in depths.columns]
+    n, h, _ = accumulate([depths.target], columns, weights)
+    return tuple(solve(n, h))
+
+
+def _finite(normal: Sequence[Array]) -> Float[Array, "3"]:
+    return jnp.stack([jnp.where(jnp.isfinite(c), c, 0.0) for c in normal])
 
 
 def _plus_outer(m: rot.Matrix, a: rot.Vector, b: rot.Vector) -> rot.Matrix:
@@ -202,9 +225,8 @@ def _rays(pair: Pair, point: coplanarity.Point) -> tuple[rot.Vector, rot.Vector]
     return left, right
 
 
-def _inverse_depths(pair: Pair, pose: RelativePose) -> tuple[list, Array, Array]:
-    """The coordinates of p1, the inverse depth n · p1 of every point at the pose, and
-    its weight |c x b|²."""
+def _inverse_depths(pair: Pair, pose: RelativePose) -> InverseDepths:
+    """`InverseDepths` at a pose."""
     rotation, base = pose.relative()
 
     def of_point(point):
@@ -215,8 +237,7 @@ def _inverse_depths(pair: Pair, pose: RelativePose) -> tuple[list, Array, Array]
         safe = jnp.where(squared > 0, squared, 1.0)
         return left, rot.dot(across, rot.cross(c, left)) / safe, squared
 
-    columns, target, sure = jax.vmap(of_point)(pair.coordinates)
-    return list(columns), target, sure
+    return InverseDepths(*jax.vmap(of_point)(pair.coordinates))
 
 
 def _transfer_errors(pair: Pair, pose: RelativePose) -> Callable:
@@ -270,16 +291,14 @@ def refined(
     """The pose after some Gauss-Newton steps on the points in use, or unchanged where
     they fail."""
     residuals = coplanarity.residuals(pair.with_mask(pair.mask & use), pose)
-    moved = pose.move(
-        steps(residuals, (jnp.zeros_like(pair.focal_left),) * 5, count, 0.3)
-    ).normalise()
+    moved = pose.move(steps(residuals, pose.origin, count, 0.3)).normalise()
     fine = squares(pair.with_mask(use), moved) <= squares(pair.with_mask(use), pose)
     return jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved, pose)
 
 
 def squares(pair: Pair, pose: RelativePose) -> Float[Array, ""]:
     """Σ r² of the points at a pose."""
-    r = coplanarity.residuals(pair, pose)((jnp.zeros_like(pair.focal_left),) * 5)
+    r = coplanarity.residuals(pair, pose)()
     return jnp.sum(jnp.where(pair.mask, r * r, 0.0))
 
 
@@ -288,18 +307,3 @@ def facing(pair: Pair, pose: RelativePose) -> RelativePose:
     photos."""
     sign = jnp.where(inspect(pair, pose).in_front < 0, -1.0, 1.0)
     return pose.turn_base(sign)
-
-
-def behind(pair: Pair, pose: RelativePose) -> Float[Array, ""]:
-    """The share of points behind a photo."""
-    rotation, base = pose.relative()
-
-    def one(point):
-        *_, left, right = coplanarity.rays(
-            None, rotation, base, point, pair.focal_left, pair.focal_right
-        )
-        return (left <= 0) | (right <= 0)
-
-    return count(pair.mask & jax.vmap(one)(pair.coordinates)) / jnp.maximum(
-        count(pair.mask), 1.0
-    )

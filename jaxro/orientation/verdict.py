@@ -1,16 +1,20 @@
 """How an orientation ended: a table of conditions in the order of their precedence."""
 
+import dataclasses
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment import results
 from ..geometry.elements import AbstractElements
-from ..geometry.pairs import Pair
+from ..geometry.pairs import Pair, mask_unusable
+from ..xla.passes import total
 from . import chosen_elements, degeneracy, planes
 from .degeneracy import WorstDirection
 from .describe import Description
 from .problem import Problem
+from .result import Orientation
 from .results import RESULTS, of_adjustment
 from .solve import Solution
 
@@ -27,7 +31,8 @@ def verdict(
     bad_input: Bool[Array, ""],
 ) -> RESULTS:
     """The first result of the table whose condition holds, or else how the adjustment
-    ended. `bad_input`: whether something had to be left out of the pair."""
+    ended; `check_plane` is still to come. `bad_input`: whether something had to be left
+    out of the pair."""
     start, adjustment = solution
     noise, pose = description.noise, description.pose
     freedom = adjustment.degrees_of_freedom
@@ -38,7 +43,6 @@ def verdict(
         pair, adjustment.parameters, adjustment.cofactor
     )
     second, undivided = degeneracy.find_second(direction, noise)
-    twin = _twin_fits(pair, solution, description)
     rotation = degeneracy.pure_rotation(
         description.inspection, noise.freedom, description.sigma0
     )
@@ -60,7 +64,7 @@ def verdict(
             solved & chosen_elements.wrong_side(problem.elements, problem.length, pose),
         ),
         (RESULTS.points_behind_camera, solved & (description.behind > 0)),
-        (RESULTS.two_solutions, solved & (start.ambiguous | second | twin)),
+        (RESULTS.two_solutions, solved & (start.ambiguous | second)),
         (RESULTS.no_redundancy, solved & (freedom == 0)),
     )
     result = of_adjustment(adjustment.result)
@@ -100,18 +104,21 @@ def _lack_elements(
     return missing | uncertain | rounding
 
 
-def _twin_fits(
-    pair: Pair, solution: Solution, description: Description
-) -> Bool[Array, ""]:
-    """Whether the second pose, which exists if the points lie in a plane, fits them as
-    well; whether they do, its Σ r² tells."""
-    start, adjustment = solution
-    inspection, noise = description.inspection, description.noise
-    solved = adjustment.result == results.RESULTS.successful
-    asked = inspection.twin & (noise.freedom > 0) & ~start.ambiguous & solved
-    fixed_pair, fixed_pose = lax.stop_gradient((pair, description.pose))
-    squares = planes.second_squares(fixed_pair, fixed_pose, asked)
-    sigma = jnp.where(inspection.sigma > 0, inspection.sigma, 1.0)
+def check_plane(
+    pair: Pair, orientation: Orientation, asked: Bool[Array, ""]
+) -> Orientation:
+    """The orientation with the result `two_solutions` where that is `asked` and the
+    second pose, which exists if the points lie in a plane, fits them as well; whether
+    they do, its Σ r² tells. Few pairs are asked."""
+    pair, pose = lax.stop_gradient((mask_unusable(pair)[0], orientation.pose))
+    squares = planes.second_squares(pair, pose, asked)
+    n = jnp.maximum(pair.count, 1.0)
+    mean_square = total(jnp.where(pair.mask, pair.sigma**2, 0.0)) / n
+    sigma = jnp.where(mean_square > 0, jnp.sqrt(mean_square), 1.0)
+    freedom = orientation.degrees_of_freedom.astype(sigma.dtype)
+    sigma0 = lax.stop_gradient(jnp.where(freedom > 0, orientation.sigma0, 0.0))
+    noise = degeneracy.noise(sigma0, freedom, sigma, pair.focal_left)
     rounding = planes.ROUNDING * pair.count * (pair.focal_left / sigma) ** 2
-    best = noise.freedom * description.sigma0**2
-    return squares <= noise.tolerance(best) + rounding
+    fits = squares <= noise.tolerance(freedom * sigma0**2) + rounding
+    result = RESULTS.where(asked & fits, RESULTS.two_solutions, orientation.result)
+    return dataclasses.replace(orientation, result=result)

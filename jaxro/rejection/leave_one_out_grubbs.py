@@ -20,7 +20,6 @@ from .masked import mean_of
 from .parallaxes import (
     adjust_parallaxes,
     iterate_once,
-    no_displacement,
     parallax_residuals,
     parallaxes,
 )
@@ -68,7 +67,7 @@ def influence(
 ) -> Influence:
     """The influence of the parallaxes of the points in use on the solution."""
     residuals = parallax_residuals(pair, mask, elements)
-    (q,), jacobian, weight = residuals.columns(no_displacement(pair))
+    (q,), jacobian, weight = residuals.columns()
     n, _, _ = accumulate([q], jacobian, weight)
     columns = [jnp.where(mask, column, 0.0) for (column,) in jacobian]
     solved = substitute(cholesky(n)[0], columns)

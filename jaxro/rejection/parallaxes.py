@@ -54,7 +54,7 @@ def iterate_once(
 ) -> AbstractElements:
     """The elements after one iteration of this adjustment."""
     residuals = parallax_residuals(pair, mask, elements)
-    moved = steps(residuals, no_displacement(pair), 1, float("inf"))
+    moved = steps(residuals, elements.origin, 1, float("inf"))
     return elements.move(moved)
 
 
@@ -63,7 +63,7 @@ def parallaxes(
 ) -> PointValues:
     """q of the points in use at given elements; zero of all others."""
     residuals = parallax_residuals(pair, mask, elements)
-    return residuals(no_displacement(pair))
+    return residuals()
 
 
 def parallax_residuals(
@@ -72,11 +72,6 @@ def parallax_residuals(
     """q of the points in use as a function of a displacement of the elements."""
     term = coplanarity.parallax(pair.with_sigma(1.0).with_mask(mask))
     return Residuals(term, elements)
-
-
-def no_displacement(pair: Pair) -> tuple[Array, ...]:
-    """Zero for each of the five elements."""
-    return (jnp.zeros_like(pair.focal_left),) * 5
 
 
 def reject_once(

@@ -134,14 +134,12 @@ def report_elements(
         return (*base, *rot.omega_phi_kappa(rot.transpose(rotation)))
 
     zero = (jnp.zeros_like(sigma0),) * 5
-    jacobian = jax.jacfwd(values, argnums=tuple(range(5)))(*zero)
-    variance = lambda row: sum(
-        (row[i] * row[j] * cofactor[i, j] for i in range(5) for j in range(5)), zero[0]
-    )
+    slopes = jax.jacfwd(values, argnums=tuple(range(5)))(*zero)
+    jacobian = jnp.stack([jnp.stack(row) for row in slopes])
+    products = jacobian[:, :, None] * jacobian[:, None, :] * cofactor[None]
+    deviations = sigma0 * root(jnp.sum(products, axis=(1, 2)))
     angles = (False,) * 3 + (True,) * 3
-    return degrees(values(*zero), angles), degrees(
-        [sigma0 * root(variance(row)) for row in jacobian], angles
-    )
+    return degrees(values(*zero), angles), degrees(list(deviations), angles)
 
 
 class Told:

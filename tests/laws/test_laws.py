@@ -542,6 +542,22 @@ def test_vertical_start_is_enough_for_vertical_photos():
     np.testing.assert_allclose(numbers(two.elements), numbers(one.elements), atol=1e-9)
 
 
+def test_slopes_of_a_bilinear_function_are_those_of_any_function():
+    key = jax.random.split(jax.random.key(8), 2)
+    pose = jaxro.to_pose(IndependentElements(*(0.4 * jax.random.normal(key[0], (5,)))))
+    x = tuple(0.3 * jax.random.normal(key[1], (5,)))
+    focals = jnp.asarray(100.0), jnp.asarray(150.0)
+    fundamental = lambda *pose: coplanarity.fundamental_matrix(*pose, *focals)
+    for step in (x, ()):
+        known = pose.slopes(fundamental, step, bilinear=True)
+        found = pose.slopes(fundamental, step)
+        for one, other in zip(*map(jax.tree.leaves, (known, found)), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-9)
+    still = pose.slopes(fundamental, pose.origin)
+    for one, other in zip(*map(jax.tree.leaves, (known, still)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-9)
+
+
 @every_system
 def test_slopes_are_derivatives_along_further_steps(system):
     """Of R and b without their scale, which an unnormalised pose leaves open."""

@@ -295,14 +295,6 @@ def test_decomposition_gives_the_orientation_back(scale):
     np.testing.assert_allclose(pose.base, base, atol=1e-12)
     turned = jax.vmap(lambda one: rot.as_array(one.relative()[0]))(pose)
     np.testing.assert_allclose(turned, rotation, atol=1e-12)
-    front = jax.vmap(decomposition.cheirality)(
-        *map(jnp.asarray, (rotation, base, p1, p2, mask))
-    )
-    behind = jax.vmap(decomposition.cheirality)(
-        *map(jnp.asarray, (rotation, -base, p1, p2, mask))
-    )
-    assert np.all(np.asarray(front) == 5)
-    assert np.all(np.asarray(behind) == 0)
 
 
 def test_decomposition_of_a_measured_matrix_is_that_of_singular_values():

@@ -95,11 +95,10 @@ def approach(pair: Pair, count: int) -> RelativePose:
     pose = vertical(pair.focal_left)
     if count == 0:
         return pose
-    zero = (jnp.zeros_like(pair.focal_left),) * 5
-    near = _take_step(pose, normal.steps(FirstOrder(pair), zero, 1, LONGEST))
+    near = _take_step(pose, normal.steps(FirstOrder(pair), pose.origin, 1, LONGEST))
     if count == 1:
         return near
-    further = normal.steps(distances(pair, near), zero, count - 1, LONGEST)
+    further = normal.steps(distances(pair, near), near.origin, count - 1, LONGEST)
     return _take_step(near, further)
 
 

@@ -37,18 +37,6 @@ def decompose(
     return _decompose_one(essential)
 
 
-def cheirality(
-    rotation: Float[Array, "3 3"],
-    base: Float[Array, "3"],
-    left: Images,
-    right: Images,
-    mask: Bool[Array, "point"],
-) -> Int[Array, ""]:
-    """How many points lie in front of both photos: λ > 0 and μ > 0 in λ p1 = b + μ R
-    p2."""
-    return _in_front_one(rotation, base, left, right, mask)[0]
-
-
 def best_pose(
     essential: Float[Array, "3 3"],
     left: Images,
@@ -147,6 +135,4 @@ def _scaled(m: Square, squares: float) -> Square:
     )
 
 
-_decompose_one, _in_front_one, _best_pose_one = (
-    problems_last(f) for f in (_decompose, _in_front, _best_pose)
-)
+_decompose_one, _best_pose_one = (problems_last(f) for f in (_decompose, _best_pose))

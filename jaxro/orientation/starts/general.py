@@ -20,9 +20,9 @@ from ...geometry.pairs import Pair, mask_unusable, pad
 from ...xla.selection import where_needed
 from .. import degeneracy, planes
 from ..degeneracy import significant
-from ..inspection import inspect
+from ..inspection import Inspection, inspect
 from .base import AbstractStart, StartingPose, distances
-from .decomposition import best_pose, cheirality
+from .decomposition import best_pose
 from .eight_point import eight_point
 from .five_point import five_point
 
@@ -74,24 +74,21 @@ class General(AbstractStart):
     def _begin(self, pair: Pair) -> StartingPose:
         # of no points there are no candidates to choose from
         pair = _accurate(pad(pair, max(pair.x_left.shape[0], 1)))
-        first, second, exists = self._two_best(pair)
-        left, right = vectors(pair)
-        freedom = pair.count - 5
-        squares = inspect(pair, first).distance ** 2
-        turn, parallax = rotation_only(left, right, pair.mask)
-        noise = jnp.sqrt(squares * pair.count / jnp.maximum(freedom, 1.0))
+        best, exist = self._two_best(pair)
+        inspected = jax.vmap(lambda pose: inspect(pair, pose))(best)
+        first, second = (jax.tree.map(lambda a, i=i: a[i], inspected) for i in (0, 1))
+        turn, parallax = rotation_only(*vectors(pair), pair.mask)
+        freedom = jnp.maximum(pair.count - 5, 1.0)
+        noise = first.distance * jnp.sqrt(pair.count / freedom)
         focal = common_focal(pair.focal_left, pair.focal_right)
         noise = noise * pair.focal_left / focal
-        pure = parallax < significant(freedom) * noise + 1e-9
-        in_front = _behind(second, left, right, pair.mask) <= BEHIND
-        ambiguous = exists & in_front & _fits_as_well(pair, first, second)
-        pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b), turn, first)
-        return StartingPose(pose, ambiguous & ~pure, pure)
+        pure = parallax < significant(pair.count - 5) * noise + 1e-9
+        fits = (second.behind <= BEHIND) & _fits_as_well(pair, first, second)
+        pose = jax.tree.map(lambda a, b: jnp.where(pure, a, b[0]), turn, best)
+        return StartingPose(pose, exist[1] & fits & ~pure, pure)
 
-    def _two_best(
-        self, pair: Pair
-    ) -> tuple[RelativePose, RelativePose, Bool[Array, ""]]:
-        """The best candidate, the best other one, and whether there is another one."""
+    def _two_best(self, pair: Pair) -> tuple[RelativePose, Bool[Array, "2"]]:
+        """The best candidate and the best other one, and which of them exist."""
         judges = _spread(pair, JUDGES)
         poses, real = self._candidates(pair, judges)
         chosen, found = _best_different(judges, poses, real, self.refined)
@@ -100,9 +97,7 @@ class General(AbstractStart):
         if judges is not pair:
             best = jax.vmap(lambda pose: _refine(pair, pose, FINAL))(best)
             best, exist = _best_different(pair, best, exist, 2)
-        best, exist = _with_twin(pair, best, exist)
-        first, second = (jax.tree.map(lambda a, i=i: a[i], best) for i in (0, 1))
-        return first, second, exist[1]
+        return _with_twin(pair, best, exist)
 
     def _candidates(
         self, pair: Pair, judges: Pair
@@ -126,20 +121,16 @@ class General(AbstractStart):
         return poses, jnp.concatenate([real, jnp.ones(1, bool)])
 
 
-def _fits_as_well(
-    pair: Pair, first: RelativePose, second: RelativePose
-) -> Bool[Array, ""]:
+def _fits_as_well(pair: Pair, first: Inspection, second: Inspection) -> Bool[Array, ""]:
     """Whether the second pose fits as well as the first, for the measuring errors."""
-    inspected = inspect(pair, first)
-    squares = inspected.distance**2
-    other = inspect(pair, second).distance ** 2
+    squares = first.distance**2
     freedom = pair.count - 5
     # distances over f in place of residuals: sigma over f is their unit
-    unit = jnp.where(inspected.sigma > 0, inspected.sigma, 1.0) / pair.focal_left
+    unit = jnp.where(first.sigma > 0, first.sigma, 1.0) / pair.focal_left
     weight = pair.count / unit**2
     sigma0 = jnp.sqrt(squares * weight / jnp.maximum(freedom, 1.0))
-    noise = degeneracy.noise(sigma0, freedom, inspected.sigma, pair.focal_left)
-    return other < noise.tolerance(squares * weight) / weight + EXACT
+    noise = degeneracy.noise(sigma0, freedom, first.sigma, pair.focal_left)
+    return second.distance**2 < noise.tolerance(squares * weight) / weight + EXACT
 
 
 def _spread(pair: Pair, count: int) -> Pair:
@@ -199,24 +190,14 @@ def _subsets(mask: Bool[Array, " point"], count: int) -> Float[Array, "subset 5 
     ).astype(jnp.result_type(float))
 
 
-def _behind(pose: RelativePose, left, right, mask) -> Float[Array, ""]:
-    """Share of the points behind one of the photos."""
-    rotation, base = pose.relative()
-    front = cheirality(rot.as_array(rotation), rot.as_array(base), left, right, mask)
-    total = jnp.maximum(jnp.sum(mask), 1).astype(left.dtype)
-    return 1 - jnp.asarray(front, left.dtype) / total
-
-
 def _scores(pair: Pair, poses: RelativePose) -> Float[Array, " candidate"]:
     """Mean square distance over f², plus one where too many points lie behind a
     photo."""
-    left, right = vectors(pair)
 
     def one(pose):
-        wrong = _behind(pose, left, right, pair.mask) > BEHIND
-        score = jnp.maximum(inspect(pair, pose).distance ** 2, EXACT) + jnp.where(
-            wrong, 1.0, 0.0
-        )
+        inspected = inspect(pair, pose)
+        wrong = jnp.where(inspected.behind > BEHIND, 1.0, 0.0)
+        score = jnp.maximum(inspected.distance**2, EXACT) + wrong
         return jnp.where(jnp.isfinite(score), score, jnp.inf)
 
     return jax.vmap(one)(poses)
@@ -251,17 +232,16 @@ def _with_twin(pair: Pair, best: RelativePose, alone: Bool[Array, "2"]):
     """The two best of these two and of the second orientation that the first has if the
     points lie in a plane."""
     first = jax.tree.map(lambda a: a[0], best)
-    twin, exists = planes.second(
-        pair, first, planes.plane(pair, first, pair.mask, jnp.inf).normal
-    )
+    normal = planes.nearest_normal(pair, first, pair.mask)
+    twin, exists = planes.second(pair, first, normal)
     three = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), best, twin)
     return _best_different(pair, three, jnp.concatenate([alone, exists[None]]), 2)
 
 
 def _refine(pair: Pair, pose: RelativePose, count: int) -> RelativePose:
     """The pose after some Gauss-Newton steps, or unchanged where they fail."""
-    zero = jnp.zeros_like(pair.focal_left)
-    moved = pose.move(steps(distances(pair, pose), (zero,) * 5, count, 0.3)).normalise()
+    step = steps(distances(pair, pose), pose.origin, count, 0.3)
+    moved = pose.move(step).normalise()
     better = inspect(pair, moved).distance <= inspect(pair, pose).distance
     return jax.tree.map(lambda new, old: jnp.where(better, new, old), moved, pose)
 
