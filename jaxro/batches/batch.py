@@ -24,8 +24,8 @@ from ..orientation.problem import Problem, problem_of
 from ..orientation.result import Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..orientation.verdict import check_plane
-from ..rejection import OUTCOMES, AbstractProcedure, Rejection
-from ..rejection.base import stages
+from ..rejection import AbstractProcedure, Rejection
+from ..rejection.base import AbstractDecider, Decision, InStages
 from ..rejection.hypotheses import AbstractHypotheses
 from ..rejection.search import Search
 from ..xla.kernels import one_kernel, one_kernel_fusing_points
@@ -48,7 +48,10 @@ ALONE = 1 << 15
 """Points of a batch that are oriented from the vertical before other threads have
 begun."""
 
-SHORT, SOON = 1 << 13, 1 << 17
+SEARCHED = 4
+"""Pairs in a call of a program that searches: a few milliseconds of work."""
+
+SHORT, SOON = 1 << 13, 1 << 18
 """Points of a batch up to which a program runs for milliseconds, and up to which that
 of a general start or of a procedure runs for seconds. The shorter it runs, the sooner
 it has to be compiled. Up to SHORT points pairs go through one by one: `vmap` doubles
@@ -207,17 +210,19 @@ def clean_in_stages(
     report: Progress,
 ) -> PyTree:
     """What is selected of every pair's rejection, in NumPy: the stages in turn, each
-    for the pairs left in doubt."""
-    first, *others = stages(procedure, pairs.x_left.shape[-1])
-    out, again = clean_slabs(pairs, first, select, split, report)
+    for the pairs that are still open, and one conclusion for all."""
+    if not isinstance(procedure, InStages):
+        return clean_slabs(pairs, procedure, select, split, report)
+    first, *others = procedure.separate()
+    settings = _settings(pairs)  # whatever number of pairs is left open
+    decision = decide_slabs(pairs, first, split, report, settings)
     for stage in others:
-        rest = np.flatnonzero(again)
+        rest = np.flatnonzero(~decision.believed)
         if rest.size:
             left_over = jax.tree.map(lambda a, rest=rest: a[rest], pairs)
-            out, again = _replace_rows(
-                (out, again), rest, clean_slabs(left_over, stage, select, split, silent)
-            )
-    return out
+            new = decide_slabs(left_over, stage, split, silent, settings)
+            decision = _replace_rows(decision, rest, new)
+    return conclude_slabs(pairs, decision, procedure, select, split)
 
 
 def clean_slabs(
@@ -226,19 +231,40 @@ def clean_slabs(
     select: Callable[[Rejection], PyTree],
     split: Split,
     report: Progress,
-) -> tuple[PyTree, np.ndarray]:
-    """What is selected of every pair's rejection, in NumPy, and for which pairs the
-    procedure was in doubt."""
-    chunk = _chunk(pairs, split.chunk)
-    # a search has work enough in the subsets of one pair, which then waits for no other
-    if split.chunk is None and _searches(procedure):
-        chunk = 1
-    program = Program(
-        _clean_slab,
-        {"procedure": procedure, "select": select, "chunk": chunk},
-        _settings(pairs),
-    )
+) -> PyTree:
+    """What is selected of every pair's rejection, in NumPy, by one program."""
+    split, chunk = _split_of(procedure, pairs, split)
+    options = {"procedure": procedure, "select": select, "chunk": chunk}
+    program = Program(_clean_slab, options, _settings(pairs))
     return spread(pairs, program, split, chunk, report)
+
+
+def decide_slabs(
+    pairs: Pair,
+    stage: AbstractDecider,
+    split: Split,
+    report: Progress,
+    settings: dict[str, Any] | None = None,
+) -> Decision:
+    """The decisions of a stage, in NumPy."""
+    split, chunk = _split_of(stage, pairs, split)
+    options = {"stage": stage, "chunk": chunk}
+    program = Program(_decide_slab, options, settings or _settings(pairs))
+    return spread(pairs, program, split, chunk, report)
+
+
+def conclude_slabs(
+    pairs: Pair,
+    decision: Decision,
+    procedure: InStages,
+    select: Callable[[Rejection], PyTree],
+    split: Split,
+) -> PyTree:
+    """What is selected of the rejections that follow from decisions, in NumPy."""
+    chunk = _chunk(pairs, split.chunk)
+    options = {"procedure": procedure, "select": select, "chunk": chunk}
+    program = Program(_conclude_slab, options, _settings(pairs))
+    return spread((pairs, decision), program, split, chunk)
 
 
 def map_batch(
@@ -265,10 +291,15 @@ def map_batch(
     return _finish(spread(host, program, split, chunk, progress or silent))
 
 
-def _searches(procedure: AbstractProcedure) -> bool:
-    """Whether the procedure searches among random subsets of the points."""
+def _split_of(procedure: PyTree, pairs: Pair, split: Split) -> tuple[Split, int]:
+    """How the pairs of a procedure or a stage are split, and pairs per chunk. A search
+    has work enough in the subsets of one pair, which then waits for no other; and of
+    any number of pairs, so that all calls have one shape and one program."""
     is_search = lambda part: isinstance(part, AbstractHypotheses | Search)
-    return any(map(is_search, jax.tree.leaves(procedure, is_leaf=is_search)))
+    searches = any(map(is_search, jax.tree.leaves(procedure, is_leaf=is_search)))
+    if split.chunk is None and searches:
+        return split._replace(slab=split.slab or SEARCHED), 1
+    return split, _chunk(pairs, split.chunk)
 
 
 def _chunk(pairs: Any, chunk: int | None) -> int:
@@ -320,14 +351,18 @@ def _orient_slab_near(
 
 def _clean_slab(
     pairs: Pair, *, procedure: AbstractProcedure, select: Callable, chunk: int
-) -> tuple[PyTree, Array]:
-    """What is selected, and whether the procedure was not convinced."""
+) -> PyTree:
+    return map_chunks(lambda pair: select(procedure.clean(pair)), pairs, chunk)
 
-    def one(pair: Pair):
-        rejection = procedure.clean(pair)
-        return select(rejection), rejection.outcome == OUTCOMES.no_consensus
 
-    return map_chunks(one, pairs, chunk)
+def _decide_slab(pairs: Pair, *, stage: AbstractDecider, chunk: int) -> Decision:
+    return map_chunks(stage.decide, pairs, chunk)
+
+
+def _conclude_slab(
+    data: tuple[Pair, Decision], *, procedure: InStages, select: Callable, chunk: int
+) -> PyTree:
+    return map_chunks(lambda one: select(procedure.conclude(*one)), data, chunk)
 
 
 def _finish(out: PyTree) -> PyTree:

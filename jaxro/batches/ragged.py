@@ -17,14 +17,16 @@ from ..geometry.pairs import Pair, double, pair
 from ..orientation.result import PER_POINT, Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..rejection import AbstractProcedure, Rejection
+from ..rejection.base import Decision, InStages
 from ..xla.settings import keep_plain
 from ..xla.slabs import Progress, Split, silent
 from .batch import (
     clean_slabs,
+    conclude_slabs,
+    decide_slabs,
     orient_slabs,
     orient_slabs_near,
     problem_of_all,
-    stages,
 )
 from .padding import Plan, plan_for
 
@@ -279,25 +281,18 @@ def clean_ragged(
     pairs = check(pairs)
     plan = _fitting(plan, pairs)
     out = _Out(pairs, progress)
-    every = stages(procedure, max(plan.sizes))
-    # by the number of procedures that are left for a pair
-    doubtful = [[np.zeros(0, int)] for _ in every]
-    for members, size, slabs in _batches(pairs, plan.sizes, None, threads):
-        first, *others = stages(procedure, size)
-        found, doubt = clean_slabs(
-            pairs.pad_to(members, size), first, select, slabs, out.told
-        )
-        out.store(members, size, found)
-        doubtful[len(others)].append(members[doubt])
-    for left in range(len(every) - 1, 0, -1):
-        for members, size, slabs in _batches(
-            pairs, plan.fewer, None, threads, np.concatenate(doubtful[left])
-        ):
-            found, doubt = clean_slabs(
-                pairs.pad_to(members, size), every[-left], select, slabs, silent
-            )
+    batches = _batches(pairs, plan.sizes, None, threads)
+    if not isinstance(procedure, InStages):
+        for members, size, slabs in batches:
+            batch = pairs.pad_to(members, size)
+            found = clean_slabs(batch, procedure, select, slabs, out.told)
             out.store(members, size, found)
-            doubtful[left - 1].append(members[doubt])
+    else:
+        decided = _decide(pairs, procedure, plan, threads, out.told)
+        for members, size, slabs in batches:
+            batch, own = pairs.pad_to(members, size), decided(members, size)
+            found = conclude_slabs(batch, own, procedure, select, slabs)
+            out.store(members, size, found)
     if select is not decisions:
         return out.tree
     outcome, (kept, order, statistic, undecided) = out.tree
@@ -308,6 +303,30 @@ def clean_ragged(
         outcome=outcome,
         undecided=undecided,
     )
+
+
+def _decide(
+    pairs: Ragged, procedure: InStages, plan: Plan, threads: int | None, told: Progress
+) -> Callable[[Int[np.ndarray, " some"], int], Decision]:
+    """The decisions about all pairs, as a function of (members, size): the stages in
+    turn, each for the pairs that are still open."""
+    out = _Out(pairs, None)
+    open_, sizes = None, plan.sizes
+    for stage in procedure.separate():
+        for members, size, slabs in _batches(pairs, sizes, None, threads, open_):
+            batch = pairs.pad_to(members, size)
+            decision = decide_slabs(batch, stage, slabs, told)
+            of_pairs = decision._replace(use=None)
+            out.store(members, size, (of_pairs, decision.use))
+        open_, sizes, told = np.flatnonzero(~out.tree[0].believed), plan.fewer, silent
+    of_pairs, use = out.tree
+    used = pairs._replace(mask=use)
+
+    def decided(members: Int[np.ndarray, " some"], size: int) -> Decision:
+        own = jax.tree.map(lambda a: a[members], of_pairs)
+        return own._replace(use=used.pad_to(members, size).mask)
+
+    return decided
 
 
 def _fitting(plan: Plan | None, pairs: Ragged) -> Plan:

@@ -5,7 +5,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ import numpy as np
 
 from ..batches.batch import clean_batch
 from ..geometry.pairs import Pair
-from ..rejection import AbstractProcedure, Rejection
+from ..orientation.results import is_usable
+from ..rejection import OUTCOMES, AbstractProcedure, Rejection
 
 OCTAVES = (0.0, 2.0, -2.0, 5.0, -5.0, 12.0, -12.0)
 """Powers of two times the procedure's own value that are tried, in this order, until
@@ -59,14 +60,11 @@ def calibrate(procedure: AbstractProcedure, clean: Pair, share: float) -> Calibr
     def value(octaves: float) -> float:
         return min(own * 2.0**octaves, most)
 
-    def with_value(value: float) -> AbstractProcedure:
-        # an array, so that one compiled program serves all values
-        field = lambda p: getattr(p, name)
-        return eqx.tree_at(field, procedure, jnp.asarray(value))
-
     def excess(octaves: float) -> float:
-        alarms = clean_batch(clean, with_value(value(octaves)), select=_alarm)
-        return float(np.mean(np.asarray(alarms))) - share
+        at_value = set_value(procedure, name, value(octaves))
+        order = clean_batch(clean, at_value, select=select)[1]
+        alarms = np.any(np.asarray(order) > 0, axis=1)
+        return float(np.mean(alarms)) - share
 
     tried: dict[float, float] = {}
     for octaves in OCTAVES:
@@ -74,7 +72,7 @@ def calibrate(procedure: AbstractProcedure, clean: Pair, share: float) -> Calibr
         for low, high in pairwise(sorted(tried)):
             if (tried[low] > 0) != (tried[high] > 0):
                 found = value(_root(excess, low, high, tried[low] > 0))
-                return Calibration(with_value(found), name, found, "")
+                return Calibration(set_value(procedure, name, found), name, found, "")
     nearest = share + min(tried.values(), key=abs)
     reason = f"not adjustable: {name} reaches {nearest:.1%} at best"
     return Calibration(None, name, math.nan, reason)
@@ -94,5 +92,21 @@ def _root(
     return (low + high) / 2
 
 
-def _alarm(found: Rejection):
-    return jnp.any(found.order > 0)
+def set_value(procedure: AbstractProcedure, name: str, value: float) -> Any:
+    """The procedure with this value of a field, as an array: one compiled program
+    serves all values."""
+    return eqx.tree_at(lambda p: getattr(p, name), procedure, jnp.asarray(value))
+
+
+def select(found: Rejection) -> tuple:
+    """What is kept of every pair: (points kept, order, pose, whether it is usable,
+    whether the procedure finished); the same for all that is compared, so that it is
+    compiled once."""
+    orientation = found.orientation
+    return (
+        found.mask,
+        found.order,
+        orientation.pose,
+        is_usable(orientation.result),
+        found.outcome == OUTCOMES.finished,
+    )

@@ -27,11 +27,10 @@ from ..geometry.elements import RelativePose
 from ..geometry.mock_pairs import draw_points, noisy, plant
 from ..geometry.pairs import Pair
 from ..orientation.orient import orient
-from ..orientation.results import is_usable
-from ..rejection import OUTCOMES, AbstractProcedure, Rejection
+from ..rejection import AbstractProcedure
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
-from .calibration import Calibration, adjustable, calibrate
+from .calibration import Calibration, adjustable, calibrate, select, set_value
 
 LEAST = 6
 """Good points that a pair has at least."""
@@ -170,7 +169,11 @@ def _versions(
     """Every procedure as it is, and those that can be set also calibrated."""
     versions = []
     for name, procedure in procedures.items():
-        versions.append(Version(name, False, procedure))
+        field = adjustable(procedure)
+        own = procedure
+        if field is not None:  # by the program of the calibrated one
+            own = set_value(procedure, field, getattr(procedure, field))
+        versions.append(Version(name, False, own))
         if name in settable:
             versions.append(Version(name, True, known[name].procedure))
     return versions
@@ -228,7 +231,7 @@ def _judge(
     procedure: AbstractProcedure, pairs: Pair, wrong: np.ndarray, truth: RelativePose
 ) -> dict[str, Estimate]:
     """The estimates of a `Score`."""
-    kept, order, pose, usable, finished = clean_batch(pairs, procedure, select=_select)
+    kept, order, pose, usable, finished = clean_batch(pairs, procedure, select=select)
     angle = np.asarray(Program(_angles, {}, COMPILE_FAST)((truth, pose)))
     mask = np.asarray(pairs.mask)
     out, good = mask & ~np.asarray(kept), mask & ~wrong
@@ -247,17 +250,6 @@ def _judge(
         "unfinished": estimate(~np.asarray(finished)),
         "angle": root_mean_square(angle[np.asarray(usable)]),
     }
-
-
-def _select(found: Rejection):
-    orientation = found.orientation
-    return (
-        found.mask,
-        found.order,
-        orientation.pose,
-        is_usable(orientation.result),
-        found.outcome == OUTCOMES.finished,
-    )
 
 
 def _angles(truth_and_poses: tuple[RelativePose, RelativePose]):

@@ -13,7 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..adjustment import critical_values
 from ..adjustment.normal_equations import cholesky, substitute
@@ -24,7 +24,7 @@ from ..geometry.pairs import Pair
 from ..xla.kernels import while_loop
 from ..xla.passes import count
 from .masked import Use, Values, sum_of
-from .steps import improve, inner, normal_equations
+from .steps import inner, normal_equations, take_step
 
 LEAST = 0.01
 """Smallest redundancy of a point when sets are compared: below it a point would be
@@ -56,8 +56,7 @@ def squares(pair: Pair, pose: RelativePose) -> Values:
     """(r / sigma)² of every point; zero of masked ones."""
     residuals = coplanarity.residuals(pair, pose)
     square = lambda g, d, use: jnp.where(use, g[0] ** 2 / d[0][0], 0.0)
-    here = residuals.shared(*(jnp.zeros_like(pair.focal_left),) * 5)
-    return residuals.groups(square, here)
+    return residuals.groups(square, residuals.shared())
 
 
 def points_within(pair: Pair, pose: RelativePose, limit: ArrayLike) -> Use:
@@ -101,23 +100,25 @@ def keep_agreeing(
     limit = jnp.asarray(limit, pair.sigma.dtype)
 
     def turn(state):
-        k, _, pose, use = state
-        pose = improve(pair, pose, use)
-        w = normalised_residuals(linearise(pair, pose), use)
-        new = pair.mask & (w <= limit)
+        k, _, _, use, ahead = state
+        linear = linearise(pair, ahead)
+        agree = pair.mask & (normalised_residuals(linear, use) <= limit)
+        new = jnp.where(k == 0, use, agree)
         changed = count(new ^ use) > 0
-        return k + 1, (k == 0) | changed, pose, new
+        return k + 1, (k <= 1) | changed, ahead, new, _step(ahead, linear, new)
 
-    return _repeat(rounds, jnp.asarray(True), turn, pair, pose, use)[1:]
+    state = _repeat(rounds, jnp.asarray(True), turn, pair, pose, use, pose)
+    _, pose, use, _ = state
+    return pose, use
 
 
-@partial(jax.jit, static_argnames="rounds")
+@jax.jit
 def one_by_one(
     pair: Pair,
     pose: RelativePose,
     use: Use,
+    rounds: Int[Array, ""],
     limit: ArrayLike,
-    rounds: int,
     wanted: Bool[Array, ""] | bool = True,
 ) -> tuple[tuple[RelativePose, Use], Float[Array, ""], Bool[Array, ""]]:
     """(pose, points) near the least cost, that cost (before the last change if the set
@@ -139,31 +140,43 @@ def one_by_one(
     cut = jnp.asarray(limit, pair.sigma.dtype) ** 2 + widening
 
     def turn(state):
-        k, _, pose, use, _ = state
-        pose = improve(pair, pose, use)
-        linear = linearise(pair, pose)
+        k, _, _, use, _, ahead = state
+        linear = linearise(pair, ahead)
         variance, log_det = _variances(linear, use)
         cost = sum_of(jnp.where(use, linear.squares, cut), pair.mask) + log_det
+        cost = jnp.where(jnp.isfinite(cost) & (k > 0), cost, jnp.inf)
         over = linear.squares / variance - cut
         redundancy = jnp.maximum(variance, LEAST)
         gain = jnp.where(use, over, -over) - jnp.log(redundancy)
         gain = jnp.where(pair.mask, gain, 0.0)
         best = jnp.max(gain)
         better = best > 0
-        use = use ^ ((gain == best) & better)
-        cost = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
-        return k + 1, better, pose, use, cost
+        use = use ^ ((gain == best) & better & (k > 0))
+        return k + 1, better | (k == 0), ahead, use, cost, _step(ahead, linear, use)
 
-    start = pose, use, cut + jnp.inf
-    going, pose, use, cost = _repeat(rounds, wanted, turn, pair, *start)
+    start = pose, use, cut + jnp.inf, pose
+    going, pose, use, cost, _ = _repeat(rounds, wanted, turn, pair, *start)
     return (pose, use), cost, wanted & ~going
 
 
+def _step(pose: RelativePose, linear: Linear, use: Use) -> RelativePose:
+    """The pose after one step of least squares on the points in use."""
+    return take_step(pose, linear, jnp.where(use, linear.weight, 0.0))
+
+
 def _repeat(
-    rounds: int, going: Bool[Array, ""], turn: Callable, pair: Pair, *state: PyTree
+    rounds: int | Int[Array, ""],
+    going: Bool[Array, ""],
+    turn: Callable,
+    pair: Pair,
+    *state: PyTree,
 ):
-    """(going, *state) after turns (k, going, *state) -> the same, while they go on, at
-    most `rounds`."""
-    more = lambda state: state[1] & (state[0] < rounds)
+    """(going, *state) after turns (k, going, *state) -> the same, while they go on. The
+    first only takes a step; at most `rounds` follow.
+
+    A turn judges at the pose `ahead`, to which the last step led, and takes the next
+    step from there: the conditions are linearised once.
+    """
+    more = lambda state: state[1] & (state[0] <= rounds)
     start = (jnp.zeros((), int), going, *state)
     return while_loop(more, turn, start, pair.focal_left)[1:]

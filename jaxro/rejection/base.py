@@ -2,13 +2,14 @@
 
 import abc
 import dataclasses
-from typing import Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, double, first_points, pad, room_for
 from ..orientation.orient import Orientation
 from ..xla.passes import count
@@ -149,37 +150,77 @@ class AbstractProcedure(eqx.Module):
                 f"{pair.x_left.shape}: use jax.vmap, or clean_batch"
             )
         pair = double(pair)
-        if is_traced((pair, self)):
-            return _program(self, pair.x_left.size)(pair)
         points = pair.x_left.size
+        if is_traced((pair, self)):
+            program = Program(clean, {"procedure": self}, settings_for(points))
+            return program(pair)
         pair = pad(pair, room_for(points))
-        for part in stages(self, points):
-            found = _program(part, points)(pair)
-            if bool(found.outcome != OUTCOMES.no_consensus):
-                break
-        return found.first(points)  # pyright: ignore[reportPossiblyUnboundVariable]
+        settings = settings_for(points)
+        if isinstance(self, InStages):
+            decision = decide_in_turn(self, pair, settings)
+            program = Program(conclude, {"procedure": self}, settings)
+            found = program((pair, decision))
+        else:
+            found = Program(clean, {"procedure": self}, settings)(pair)
+        return found.first(points)
+
+
+class Decision(NamedTuple):
+    """The pose, the points that agree with it, whether that is believed, and the factor
+    of the standard deviations of the pair by which they were judged."""
+
+    pose: RelativePose
+    use: Bool[Array, "*pairs point"]
+    believed: Bool[Array, "*pairs"]
+    scale: Float[Array, "*pairs"]
+
+
+class AbstractDecider(eqx.Module):
+    """A stage of a procedure: it decides on a pair, or leaves it open."""
+
+    @abc.abstractmethod
+    def decide(self, pair: Pair) -> Decision:
+        """The decision about one pair; works under jit and vmap."""
 
 
 @runtime_checkable
 class InStages(Protocol):
-    """A procedure that consists of others, each for the pairs that the one before left
-    in doubt."""
+    """A procedure that decides in stages, each for the pairs that the one before left
+    open, and concludes from the decision. Each stage and the conclusion are programs of
+    their own: small ones, and only those that some pair needs."""
 
-    def separate(self, points: int) -> list[AbstractProcedure]:
-        """The procedures to be tried in turn on pairs of up to so many points."""
+    def separate(self) -> list[AbstractDecider]:
+        """The stages in turn."""
+        ...
+
+    def conclude(self, pair: Pair, decision: Decision) -> Rejection:
+        """The result that follows from the decision about one pair."""
         ...
 
 
-def stages(procedure: AbstractProcedure, points: int) -> list[AbstractProcedure]:
-    """The procedures to be tried in turn on pairs of up to so many points."""
-    if isinstance(procedure, InStages):
-        return procedure.separate(points)
-    return [procedure]
+def decide_in_turn(
+    procedure: InStages, pair: Pair, settings: dict[str, Any]
+) -> Decision:
+    """The decision of the first stage that is believed, or else of the last."""
+    first, *others = procedure.separate()
+    decision = Program(decide, {"stage": first}, settings)(pair)
+    for stage in others:
+        if bool(decision.believed):
+            break
+        decision = Program(decide, {"stage": stage}, settings)(pair)
+    return decision
 
 
-def _program(procedure: AbstractProcedure, points: int) -> Program:
-    return Program(_clean, {"procedure": procedure}, settings_for(points))
-
-
-def _clean(pair: Pair, *, procedure: AbstractProcedure) -> Rejection:
+def clean(pair: Pair, *, procedure: AbstractProcedure) -> Rejection:
+    """The result for one pair, as a program."""
     return procedure.clean(pair)
+
+
+def decide(pair: Pair, *, stage: AbstractDecider) -> Decision:
+    """The decision of a stage, as a program."""
+    return stage.decide(pair)
+
+
+def conclude(data: tuple[Pair, Decision], *, procedure: InStages) -> Rejection:
+    """The conclusion of a procedure, as a program."""
+    return procedure.conclude(*data)

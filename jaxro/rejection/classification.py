@@ -35,7 +35,7 @@ from ..xla.kernels import while_loop
 from ..xla.passes import count, total
 from . import OUTCOMES, Recommended, Rejection, evidence
 from .agreement import keep_agreeing, squares
-from .visibility import in_front, parallel, seen
+from .visibility import look, seen
 
 ENGINE = Recommended()
 """The procedure that decides on pose and matches; the standard deviations are those of
@@ -164,8 +164,8 @@ def in_plane(
         inside = mask_unusable(pair.with_mask(pair.mask & needed))[0]
         in_it = inside.with_mask(inside.mask & flat.within)
         other, exists = planes.second(in_it, pose, flat.normal)
-        in_front_of_other = count(flat.within & in_front(inside, other))
-        more = in_front_of_other > count(flat.within & in_front(inside, pose))
+        in_front = lambda pose: count(flat.within & look(inside, pose).in_front)
+        more = in_front(other) > in_front(pose)
         other, others = keep_agreeing(inside, other, in_it.mask, limit, ROUNDS)
         others = others & seen(inside, other, limit)
         normal = planes.plane(inside, other, others, limit).normal
@@ -189,11 +189,10 @@ def without_base(
     # a large sigma0 may hide a base, therefore the rays themselves have to be parallel
     # after the rotation. Without a base the engine finds one that some wrong matches
     # agree on: their parallaxes do not prove it
-    turns = lambda _, still: parallel(
-        pair, rotation_only(*vectors(pair), use & still)[0], limit
-    )
+    rotated_by = lambda still: rotation_only(*vectors(pair), use & still)[0]
+    turns = lambda _, still: look(pair, rotated_by(still), limit).parallel
     still = lax.fori_loop(0, TURNS, turns, pair.mask)
-    rotated = rotation_only(*vectors(pair), use & still)[0]
+    rotated = rotated_by(still)
     few = count(use & ~still) <= ALIKE + CHANCE * count(pair.mask & ~still)
     most = count(use & still) >= PLANE * count(use)
     turned = ((result == RESULTS.zero_base) | few) & most

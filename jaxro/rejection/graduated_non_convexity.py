@@ -46,16 +46,17 @@ class GraduatedNonConvexity(AbstractSearch):
         """The pose after all graded steps, which are as good in single precision."""
         single = in_single(pair)
 
-        def flatten(_, pose):
-            return step_by_weights(single, pose, lambda s: 1 / jnp.sqrt(s + 1))
-
-        def grade(i, pose):
-            share = i.astype(jnp.float32) / max(self.graded - 1, 1)
+        def step(i, pose):
+            share = (i - self.absolute).astype(jnp.float32) / max(self.graded - 1, 1)
             variance = self.widest**2 * (self.limit / self.widest) ** (2 * share)
-            return step_by_weights(single, pose, lambda s: geman_mcclure(s, variance))
+
+            def weight(s):
+                graded = geman_mcclure(s, variance)
+                return jnp.where(i < self.absolute, lax.rsqrt(s + 1), graded)
+
+            return step_by_weights(single, pose, weight)
 
         pose = in_single(self.start(pair).pose)
-        pose = lax.fori_loop(0, self.absolute, flatten, pose)
-        pose = lax.fori_loop(0, self.graded, grade, pose)
+        pose = lax.fori_loop(0, self.absolute + self.graded, step, pose)
         double = lambda a: a.astype(pair.focal_left.dtype)
         return jax.tree.map(double, pose).normalise()

@@ -17,6 +17,7 @@ points, which finds few and small errors best.
 
 import dataclasses
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -28,11 +29,11 @@ from ..geometry.pairs import Pair, mask_unusable
 from ..xla.kernels import if_needed
 from ..xla.passes import count
 from .agreement import familywise_limit, normalised_residuals, state_sigma
-from .base import OUTCOMES, AbstractProcedure, Rejection
+from .base import OUTCOMES, AbstractDecider, AbstractProcedure, Decision, Rejection
 from .fading import fade
 from .masked import Use
 from .quick import Plain, Quick
-from .stages import FEW, AbstractStage, Decision, scale_sigma
+from .stages import FEW, AbstractStage, scale_sigma
 from .thorough import Thorough
 from .verdict import verdict
 from .visibility import seen
@@ -40,6 +41,64 @@ from .visibility import seen
 UNKNOWN = 3000.0
 """Where nothing is said of the noise, a search begins with this part of the focal
 length."""
+
+
+class Level(eqx.Module):
+    """By what points are judged: `sigma`, `level` and `known` of `Recommended`."""
+
+    sigma: float | None
+    level: float
+    known: bool
+
+    def state(self, pair: Pair) -> Pair:
+        """The pair without unusable points, with this sigma."""
+        return state_sigma(mask_unusable(pair)[0], self.sigma)
+
+    def first_sigma(self, pair: Pair) -> Float[Array, ""]:
+        """The factor of the standard deviations with which a search begins."""
+        if self.known:
+            return jnp.ones_like(pair.focal_left)
+        stated = count(pair.mask & (pair.sigma != 1)) > 0
+        return jnp.where(stated, 1.0, pair.focal_left / UNKNOWN)
+
+    def limit(self, pair: Pair) -> Float[Array, ""]:
+        """The limit of |w|."""
+        return familywise_limit(self.level, pair)
+
+
+class Stages(AbstractDecider):
+    """Stages in turn, each for the pairs that the one before did not believe."""
+
+    stages: tuple[AbstractStage, ...]
+    level: Level
+
+    def decide(self, pair: Pair) -> Decision:
+        """The decision of the first stage that is believed, or else of the last."""
+        pair = lax.stop_gradient(self.level.state(pair))  # it has no derivative
+        pair = scale_sigma(pair, self.level.first_sigma(pair))
+        limit = self.level.limit(pair)
+        zero = jnp.zeros_like(limit)
+        decision = Decision(
+            pose=vertical(zero),
+            use=pair.mask & False,
+            believed=zero > 0,
+            scale=zero + 1,
+        )
+        for stage in self.stages:
+            decision = _decide_where_open(stage, pair, limit, decision)
+        return decision
+
+
+def _decide_where_open(
+    stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision
+) -> Decision:
+    """The decision of a stage where none was believed yet."""
+
+    def decide(is_open: Bool[Array, ""]) -> Decision:
+        own = pair.with_mask(pair.mask & is_open)
+        return stage(mask_unusable(own)[0], limit)
+
+    return if_needed(~before.believed, decide, before)
 
 
 class Recommended(AbstractProcedure):
@@ -53,9 +112,9 @@ class Recommended(AbstractProcedure):
     `sigma`: the standard deviation of a coordinate; if None the one of the pair.
     `level`: the probability that a pair without errors loses a point. `known`: whether
     sigma is known. If not, it only says where the search begins (at the focal length /
-    UNKNOWN for a pair whose sigma are all 1, as in pairs that state none), and the
-    points are judged by the noise that is found: sigma0 of the orientation, as a
-    multiple of the sigma of the pair.
+    UNKNOWN for a pair whose sigma are all 1, as in pairs that state none), only stages
+    that find the noise themselves decide, and the points are judged by the noise that
+    is found: sigma0 of the orientation, as a multiple of the sigma of the pair.
     """
 
     sigma: float | None = None
@@ -64,65 +123,39 @@ class Recommended(AbstractProcedure):
     known: bool = True
 
     def clean(self, pair: Pair) -> Rejection:
-        pair = state_sigma(mask_unusable(pair)[0], self.sigma)
-        fixed = lax.stop_gradient(pair)  # a decision has no derivative
-        begin = jnp.ones_like(pair.focal_left) if self.known else _first_sigma(fixed)
-        fixed = scale_sigma(fixed, begin)
-        limit = familywise_limit(self.level, pair)
-        pose, use, believed, scale = self._decide(fixed, limit)
+        every = Stages(self._deciding, self._level)
+        return self.conclude(pair, every.decide(pair))
+
+    def separate(self) -> list[AbstractDecider]:
+        """Every stage by itself."""
+        parts = [(stage,) for stage in self._deciding] or [()]
+        return [Stages(part, self._level) for part in parts]
+
+    def conclude(self, pair: Pair, decision: Decision) -> Rejection:
+        """The result that follows from a decision."""
+        pose, use, believed, scale = decision
+        pair = self._level.state(pair)
+        fixed = lax.stop_gradient(pair)
+        scale = scale * self._level.first_sigma(fixed)
         fixed = scale_sigma(fixed, scale)
+        limit = self._level.limit(pair)
         w = normalised_residuals(linearise(fixed, pose), use)
-        judged = scale_sigma(pair, begin * scale)
-        weighted = fade(judged, pose, use & believed)
-        weighted = scale_sigma(weighted, 1 / (begin * scale))
-        result = verdict(weighted, pose, use, limit, w)
+        weighted = fade(scale_sigma(pair, scale), pose, use & believed)
+        result = verdict(scale_sigma(weighted, 1 / scale), pose, use, limit, w)
         result = result.only_if(believed, OUTCOMES.no_consensus)
         return result.take_back(_in_doubt(fixed, pose, use, believed))
 
-    def _decide(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
-        """The decision of the first stage that is believed, or else of the last."""
-        zero = jnp.zeros_like(limit)
-        decision = Decision(
-            pose=vertical(zero),
-            use=pair.mask & False,
-            believed=zero > 0,
-            scale=zero + 1,
-        )
-        for stage in self.deciding:
-            decision = _decide_where_open(stage, pair, limit, decision)
-        return decision
+    @property
+    def _level(self) -> Level:
+        return Level(self.sigma, self.level, self.known)
 
     @property
-    def deciding(self) -> tuple[AbstractStage, ...]:
-        """The stages that decide: where sigma is not known only those that find the
-        noise themselves."""
+    def _deciding(self) -> tuple[AbstractStage, ...]:
+        """The stages that decide."""
         if self.known:
             return self.stages
-        return tuple(
-            dataclasses.replace(stage, known=False)
-            for stage in self.stages
-            if isinstance(stage, Thorough)
-        )
-
-    def separate(self, points: int) -> list[AbstractProcedure]:
-        """Two procedures for batches: the first stages, which are quick for any number
-        of pairs at once, and the search for the pairs that these left open."""
-        if not self.known:
-            return [self]
-        parts = self.stages[:2], self.stages[2:]
-        return [dataclasses.replace(self, stages=stages) for stages in parts if stages]
-
-
-def _decide_where_open(
-    stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision
-) -> Decision:
-    """The decision of a stage where none was believed yet."""
-
-    def decide(is_open: Bool[Array, ""]) -> Decision:
-        own = pair.with_mask(pair.mask & is_open)
-        return stage(mask_unusable(own)[0], limit)
-
-    return if_needed(~before.believed, decide, before)
+        searches = (stage for stage in self.stages if isinstance(stage, Thorough))
+        return tuple(dataclasses.replace(stage, known=False) for stage in searches)
 
 
 def _in_doubt(
@@ -139,10 +172,3 @@ def _in_doubt(
         return undecided_points(own, pose, use & asked, wrong)
 
     return if_needed(asked, find, jnp.zeros_like(use))
-
-
-def _first_sigma(pair: Pair) -> Float[Array, ""]:
-    """The factor of the standard deviations with which a search begins that does not
-    know them; 1 for a pair that states any."""
-    stated = count(pair.mask & (pair.sigma != 1)) > 0
-    return jnp.where(stated, 1.0, pair.focal_left / UNKNOWN)

@@ -88,6 +88,21 @@ class Found(NamedTuple):
     asked: Float[Array, ""]
 
 
+def nothing_found(pose: RelativePose) -> Found:
+    """The state before a search that is to begin with this orientation."""
+    zero = jnp.zeros_like(pose.qw)
+    none = zero.astype(int)
+    return Found(
+        pose=pose,
+        cost=zero + jnp.inf,
+        blocks=none,
+        counted=zero,
+        enough=zero,
+        agreed=zero,
+        asked=zero,
+    )
+
+
 class Sample(NamedTuple):
     """The points of a pair for a search: coordinates and sigma of those that take part,
     before all others; how many they are; and their order by neighbours, if it is
@@ -121,16 +136,8 @@ class Search(eqx.Module):
 
     def begin(self, pair: Pair, pose: RelativePose) -> Found:
         """The state of a search that knows one orientation."""
-        zero = jnp.zeros_like(pair.focal_left)
-        return Found(
-            pose=pose,
-            cost=cost_of(pair, pose, self.limit),
-            blocks=zero.astype(int),
-            counted=zero,
-            enough=self._enough(pair, pose),
-            agreed=zero,
-            asked=zero,
-        )
+        cost, enough = cost_of(pair, pose, self.limit), self._enough(pair, pose)
+        return nothing_found(pose)._replace(cost=cost, enough=enough)
 
     def run(
         self, pair: Pair, found: Found, worth: Float[Array, ""] | float = math.inf

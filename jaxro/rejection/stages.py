@@ -3,10 +3,11 @@ one. Another stage is another `AbstractStage`; here stands what stages share."""
 
 import abc
 import math
-from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..geometry.elements import RelativePose
@@ -15,6 +16,7 @@ from ..orientation import planes
 from ..xla.passes import count
 from . import evidence
 from .agreement import keep_agreeing, one_by_one, points_within, squares
+from .base import Decision
 from .masked import Use, choose
 from .visibility import seen
 
@@ -34,16 +36,6 @@ errors have."""
 FLAT = 0.6
 """Share of the points kept from which on their plane alone may have chosen between its
 two poses."""
-
-
-class Decision(NamedTuple):
-    """The pose, the points that agree with it, whether that is believed, and the factor
-    of the stated standard deviations by which the stage judged."""
-
-    pose: RelativePose
-    use: Use
-    believed: Bool[Array, ""]
-    scale: Float[Array, ""]
 
 
 class AbstractStage(eqx.Module):
@@ -67,9 +59,14 @@ def settle(
     found, use = keep_agreeing(pair, pose, near, limit, ROUNDS)
     out = pair.mask & ~use
     few = count(out) <= FEW
-    first, first_cost, _ = one_by_one(pair, found, use, limit, CHANGES, few)
-    other, cost, rests = one_by_one(pair, pose, pair.mask, limit, ROUNDS, few)
-    better = rests & (cost < first_cost)
+    start = lambda pose, use, rounds: (pose, use, jnp.asarray(rounds))
+    starts = start(found, use, CHANGES), start(pose, pair.mask, ROUNDS)
+    # one after the other, so that the loop is compiled once
+    every = jax.tree.map(lambda *both: jnp.stack(both), *starts)
+    judge = lambda start: one_by_one(pair, *start, limit, few)
+    judged, costs, rest = lax.map(judge, every)
+    first, other = (jax.tree.map(lambda a, k=k: a[k], judged) for k in range(2))
+    better = rest[1] & (costs[1] < costs[0])
     pose, use = choose(better, other, first)
     return pose, use & seen(pair, pose, limit)
 

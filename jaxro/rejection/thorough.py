@@ -4,6 +4,7 @@ it finds."""
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -15,15 +16,15 @@ from ..xla.kernels import if_needed, while_loop
 from ..xla.passes import count
 from . import evidence
 from .agreement import points_within, squares
+from .base import Decision
 from .graduated_non_convexity import GraduatedNonConvexity
-from .hypotheses import Newton
+from .hypotheses import Newton, best
 from .masked import Use, choose, sum_of
 from .noise import noise_of
 from .ransac import Ransac
-from .search import Found, Search, cost_of
+from .search import Found, Search, cost_of, nothing_found
 from .stages import (
     AbstractStage,
-    Decision,
     believe_if_it_fits,
     on_a_plane,
     scale_sigma,
@@ -114,8 +115,7 @@ class Thorough(AbstractStage):
         once = mask_unusable(pair.with_mask(pair.mask & ~again))[0]
         found, scale = self._search(once, self._near_vertical(once), limit)
         once = scale_sigma(once, scale)
-        pose, use = settle(once, found.pose, limit)
-        pose, use = _better_of_both_poses(once, pose, use, limit)
+        pose, use = _settle_better_pose(once, found.pose, limit)
         at_once = self.known & believe_if_it_fits(
             once, pose, use, limit, self.share, self.accidents_at_once
         )
@@ -174,7 +174,7 @@ class Thorough(AbstractStage):
             number=jnp.zeros((), int),
             again=count(pair.mask) > 0,
             scale=jnp.ones_like(limit),
-            found=self.search.begin(pair, first),
+            found=nothing_found(first),
         )
         more = lambda state: state.again & (state.number < TURNS)
         end = while_loop(more, turn, start, pair.focal_left)
@@ -222,12 +222,11 @@ class Thorough(AbstractStage):
         """The best orientation of those that begin at the vertical."""
         few = count(pair.mask) <= self.few
         small = mask_unusable(pair.with_mask(pair.mask & few))[0]
-        best = from_vertical(pair, STEPS)
-        limit = self.search.limit
-        for other in (self.graduated.search(pair), self.near.search(small)):
-            better = cost_of(pair, other, limit) < cost_of(pair, best, limit)
-            best = choose(better, other, best)
-        return best
+        plain = from_vertical(pair, STEPS)
+        found = plain, self.graduated.search(pair), self.near.search(small)
+        poses = jax.tree.map(lambda *each: jnp.stack(each), *found)
+        costs = lax.map(lambda pose: cost_of(pair, pose, self.search.limit), poses)
+        return best(poses, costs)
 
 
 def _chance(
@@ -240,26 +239,63 @@ def _chance(
     return jnp.maximum((agreed + 1) / (asked + 2), spread)
 
 
-def _better_of_both_poses(
-    pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]
+class Settled(NamedTuple):
+    """The state between the poses of a plane: how many were settled, whether another
+    one is to be, where it begins, the better pose so far and its points."""
+
+    number: Int[Array, ""]
+    again: Bool[Array, ""]
+    start: RelativePose
+    pose: RelativePose
+    use: Use
+
+
+def _settle_better_pose(
+    pair: Pair, pose: RelativePose, limit: Float[Array, ""]
 ) -> tuple[RelativePose, Use]:
-    """The pose and its points; if they are those of a plane, and others are out, the
-    one of the plane's two poses that costs less."""
-    facing, plane, flat = on_a_plane(pair, pose, use, limit)
+    """The pose and its points, settled; if they are those of a plane, and others are
+    out, of the plane's two poses the one that costs less."""
 
     def cost(pose: RelativePose, use: Use) -> Float[Array, ""]:
         each = jnp.where(use, squares(pair, pose), limit**2)
         return sum_of(each, pair.mask)
 
-    def compare(needed: Bool[Array, ""]) -> tuple[RelativePose, Use]:
-        own = pair.with_mask(pair.mask & needed)
-        in_plane = own.with_mask(plane.within & needed)
-        other, exists = planes.second(in_plane, facing, plane.normal)
-        other, others = settle(own, other, limit)
-        better = exists & (cost(other, others) < cost(pose, use))
-        return choose(better, (other, others), (pose, use))
+    def turn(state: Settled) -> Settled:
+        new = settle(pair.with_mask(pair.mask & state.again), state.start, limit)
+        before = state.pose, state.use
+        first = state.number == 0
+        better = first | (cost(*new) < cost(*before))
+        pose, use = choose(better, new, before)
+        other, exists = _other_pose(pair, pose, use, limit, first)
+        return Settled(state.number + 1, exists, other, pose, use)
 
-    return if_needed(flat, compare, (pose, use))
+    start = Settled(
+        number=jnp.zeros((), int),
+        again=count(pair.mask) > 0,
+        start=pose,
+        pose=pose,
+        use=pair.mask & False,
+    )
+    end = while_loop(lambda state: state.again, turn, start, pair.focal_left)
+    return end.pose, end.use
+
+
+def _other_pose(
+    pair: Pair,
+    pose: RelativePose,
+    use: Use,
+    limit: Float[Array, ""],
+    asked: Bool[Array, ""],
+) -> tuple[RelativePose, Bool[Array, ""]]:
+    """The other pose of the plane of the points in use, and whether it is to be
+    compared; only where it is asked for, and the plane alone may have chosen."""
+    facing, plane, flat = on_a_plane(pair, pose, use, limit)
+
+    def find(needed: Bool[Array, ""]) -> tuple[RelativePose, Bool[Array, ""]]:
+        in_plane = pair.with_mask(plane.within & needed)
+        return planes.second(in_plane, facing, plane.normal)
+
+    return if_needed(flat & asked, find, (pose, asked & False))
 
 
 def _narrow(pair: Pair, pose: RelativePose, limit: float) -> RelativePose:

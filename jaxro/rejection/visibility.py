@@ -1,5 +1,7 @@
 """Which points can be seen from both photos of a pose."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
@@ -11,43 +13,42 @@ from ..xla.passes import count
 from .masked import Use
 
 
+class Visibility(NamedTuple):
+    """The points in front of both photos, with the sign of the base that puts most
+    points there; and those whose rays are parallel within a limit."""
+
+    in_front: Use
+    parallel: Use
+
+
 def seen(pair: Pair, pose: RelativePose, limit: ArrayLike) -> Use:
     """The points in front of both photos, and those whose rays are so nearly parallel
     that the sign of their depth says nothing."""
-    return in_front(pair, pose) | parallel(pair, pose, limit)
+    visible = look(pair, pose, limit)
+    return visible.in_front | visible.parallel
 
 
-def in_front(pair: Pair, pose: RelativePose) -> Use:
-    """The points in front of both photos, with the sign of the base that puts most
-    points there."""
+def look(pair: Pair, pose: RelativePose, limit: ArrayLike = 0.0) -> Visibility:
+    """`Visibility` of the points; `limit`: in standard deviations of the angle between
+    the rays."""
     rotation, base = pose.relative()
+    focals = pair.focal_left, pair.focal_right
 
-    def depths(point):
-        *_, first, second = coplanarity.rays(
-            None, rotation, base, point, pair.focal_left, pair.focal_right
-        )
-        return first, second
-
-    first, second = jax.vmap(depths)(pair.coordinates)
-    front = pair.mask & (first > 0) & (second > 0)
-    behind = pair.mask & (first < 0) & (second < 0)
-    return jnp.where(count(front) >= count(behind), front, behind)
-
-
-def parallel(pair: Pair, pose: RelativePose, limit: ArrayLike) -> Use:
-    """The points whose rays are parallel within `limit` standard deviations of the
-    angle between them."""
-    rotation, base = pose.relative()
-
-    def is_parallel(point, sigma):
-        first, second, sine, *_ = coplanarity.rays(
-            None, rotation, base, point, pair.focal_left, pair.focal_right
+    def of_point(point, sigma):
+        first, second, sine, *depths = coplanarity.rays(
+            None, rotation, base, point, *focals
         )
         one = rot.dot(first, first)
         other = rot.dot(second, second)
         variance = sigma**2 * (1 / one + 1 / other)
         most = jnp.asarray(limit, sine.dtype) ** 2 * variance
         # |r1 x r2|² = |r1|² |r2|² sin² of the angle
-        return sine <= most * one * other
+        return sine <= most * one * other, *depths
 
-    return pair.mask & jax.vmap(is_parallel)(pair.coordinates, pair.sigma)
+    parallel, left, right = jax.vmap(of_point)(pair.coordinates, pair.sigma)
+    front = pair.mask & (left > 0) & (right > 0)
+    behind = pair.mask & (left < 0) & (right < 0)
+    return Visibility(
+        in_front=jnp.where(count(front) >= count(behind), front, behind),
+        parallel=pair.mask & parallel,
+    )
