@@ -1,7 +1,6 @@
 """One call of `jaxro colmap`: every matched pair of a COLMAP database oriented, its
 two-view geometry written."""
 
-import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from ..colmap.database import Geometry
 from ..colmap.transaction import open_database
 from ..colmap.two_view import geometries
 from ..rejection.classification import Kind
-from ..reports.terminal import consoles, progress
+from ..reports.terminal import Spent, consoles, progress, stopwatch
 from ..reports.text import number, table
 from ..tables.fields import TableError
 from ..xla.programs import pause_collection
@@ -50,7 +49,7 @@ class Options:
 class Summary:
     """What became of the pairs: their number, matches and kept matches by kind; sigma0
     of the oriented; keypoints without photo coordinates; geometries of pairs without
-    matches; seconds."""
+    matches; the time."""
 
     pairs: Counter[Kind] = field(default_factory=Counter)
     matches: Counter[Kind] = field(default_factory=Counter)
@@ -58,7 +57,7 @@ class Summary:
     sigma0: list[float] = field(default_factory=list)
     unseen: int = 0
     untouched: int = 0
-    seconds: float = 0.0
+    spent: Spent = field(default_factory=lambda: Spent(0.0, 0.0))
 
     def add(self, block: Block, rows: list[Geometry]) -> None:
         """Count the pairs of a block, whose geometries are these."""
@@ -87,7 +86,7 @@ def orient_database(options: Options, told: Progress = silent) -> Summary:
     if not (np.isfinite(options.sigma) and options.sigma > 0):
         expected = "a positive number of pixels"
         raise TableError("--sigma", found=repr(options.sigma), expected=expected)
-    begin, summary = time.perf_counter(), Summary()
+    spent, summary = stopwatch(), Summary()
     with open_database(options.database, options.out, options.force) as database:
         matched = database.pair_ids()
         pair_ids = [pair_id for pair_id, _ in matched]
@@ -102,7 +101,7 @@ def orient_database(options: Options, told: Progress = silent) -> Summary:
             database.write(rows)
             summary.add(block, rows)
         summary.untouched = database.geometries() - len(matched)
-    summary.seconds = time.perf_counter() - begin
+    summary.spent = spent()
     return summary
 
 
@@ -146,9 +145,9 @@ def _show(console: Console, options: Options, summary: Summary) -> None:
                 "Mind: keypoints seem to have about this sigma: try --sigma "
                 f"{ratio * options.sigma:.2g}"
             )
-    each = 1e3 * summary.seconds / max(pairs, 1)
+    each = 1e3 * summary.spent.work / max(pairs, 1)
     console.print(
-        f"{summary.seconds:.1f} s, {each:.2f} ms a pair. Written to "
+        f"{each:.2f} ms a pair, in all {summary.spent}. Written to "
         f"{options.out or options.database}",
         markup=False,
     )

@@ -3,7 +3,6 @@ the end of the work."""
 
 import os
 import shutil
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from ..batches.table_noise import PAIRS
 from ..rejection import AbstractProcedure
 from ..reports.columns import TABLES
 from ..reports.pair import table as terminal_table
-from ..reports.terminal import consoles, progress
+from ..reports.terminal import Spent, consoles, progress, stopwatch
 from ..tables import parquet, whole
 from ..tables.cameras import Cameras
 from ..tables.conversion import convert
@@ -71,14 +70,14 @@ def run(
 ) -> bool:
     """Plan, work, tell. True if every pair is cleaned and usable. Raises TableError;
     finished parts can be resumed."""
-    started = time.monotonic()
+    spent = stopwatch()
     console, errors = consoles()
     told = "Cleaning" if procedure else "Orienting"
     with whole.claim(options.out, check_folder_name, options.force):
         job = prepare(options, large, procedure)
         with progress(errors, told, job.pairs) as tell:
             summary = _work(job, large, tell, options.force)
-    show(console, job, summary, time.monotonic() - started)
+    show(console, job, summary, spent())
     return good(summary)
 
 
@@ -347,7 +346,7 @@ def _plain(value: Any) -> Any:
     )
 
 
-def show(console: Console, job: Job, summary: dict[str, Any], seconds: float) -> None:
+def show(console: Console, job: Job, summary: dict[str, Any], spent: Spent) -> None:
     """How the pairs ended, and where the tables are."""
     for kind, title in (("outcomes", "cleaning"), ("results", "orientation")):
         if kind in summary:
@@ -369,7 +368,7 @@ def show(console: Console, job: Job, summary: dict[str, Any], seconds: float) ->
             deviation.sentence(noise, "in the unit of the table"), markup=False
         )
     pairs = "1 pair" if summary["pairs"] == 1 else f"{summary['pairs']:,} pairs"
-    rate = f"{pairs}, {summary['rows']:,} points in {seconds:.1f} s"
+    rate = f"{pairs}, {summary['rows']:,} points in {spent}"
     tables = ", ".join(
         name
         for name in (*job.work.task.tables, "cleaned")

@@ -1,13 +1,14 @@
-"""Where reports and warnings go, and the bar that shows how far a long calculation
-is."""
+"""Where reports and warnings go, the bar that shows how far a long calculation is, and
+the time that it takes."""
 
 import codecs
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, NoReturn, TextIO
+from typing import Any, NamedTuple, NoReturn, TextIO
 
 from rich.console import Console
 from rich.segment import Segment
@@ -148,8 +149,64 @@ def abort() -> NoReturn:
     os._exit(130)
 
 
+class Spent(NamedTuple):
+    """Seconds of a work, and of compiling in addition to them."""
+
+    work: float
+    compiling: float
+
+    def __str__(self) -> str:
+        if self.compiling < LEAST_TOLD:
+            return f"{self.work:.1f} s"
+        return f"{self.work:.1f} s, and {self.compiling:.1f} s for compiling"
+
+
+class _Compiling:
+    """The seconds in which something was compiled, be it one program or several."""
+
+    def __init__(self) -> None:
+        self._lock, self._programs = threading.Lock(), 0
+        self._since = self._before = 0.0
+
+    @contextmanager
+    def one(self) -> Iterator[None]:
+        """Around one compilation."""
+        with self._lock:
+            self._before, self._since = self.seconds, time.perf_counter()
+            self._programs += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._before, self._since = self.seconds, time.perf_counter()
+                self._programs -= 1
+
+    @property
+    def seconds(self) -> float:
+        """Up to now."""
+        now = time.perf_counter() if self._programs else self._since
+        return self._before + now - self._since
+
+
+_compiling = _Compiling()
+
+
+def stopwatch() -> Callable[[], Spent]:
+    """What was spent since this call."""
+    began, before = time.perf_counter(), _compiling.seconds
+
+    def spent() -> Spent:
+        compiling = _compiling.seconds - before
+        return Spent(time.perf_counter() - began - compiling, compiling)
+
+    return spent
+
+
 SOON = 1.0
 """Seconds after which a user is told what he waits for."""
+
+LEAST_TOLD = 0.05
+"""Seconds of compiling that are told of."""
 
 
 @contextmanager
@@ -160,17 +217,18 @@ def say_compiling(shape: tuple[int, ...]) -> Iterator[None]:
     of = f"{pairs[0]} pairs of up to " if pairs and pairs[0] > 1 else ""
     once = ", once on this machine" if store.active() else ""
     line = f"Compiling for {of}{points} points{once} ..."
-    if sys.stderr is None or not sys.stderr.isatty():
-        yield
-        return
-    say = lambda: print(line, file=sys.stderr, flush=True)
-    timer = threading.Timer(SOON, say)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
+    with _compiling.one():
+        if sys.stderr is None or not sys.stderr.isatty():
+            yield
+            return
+        say = lambda: print(line, file=sys.stderr, flush=True)
+        timer = threading.Timer(SOON, say)
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
 
 
 @contextmanager

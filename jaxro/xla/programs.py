@@ -139,6 +139,7 @@ class Program:
         known = _remembered(*key).setdefault(where, {})
         if shapes in known:
             return known[shapes](*arguments)
+        found = None
         with _watch(shapes[0][0] if shapes else ()) if _watch else nullcontext():
             if store.active():
                 flat = _flat(function, self._static)
@@ -146,9 +147,9 @@ class Program:
                 program = store.load_or_compile(flat, options, arguments, key)
             else:
                 program = _compile(function, *key[1:])
-            found = program(*arguments)
+                found = program(*arguments)  # the first call compiles
         known[shapes] = program
-        return found
+        return program(*arguments) if found is None else found
 
     @property
     def outputs(self) -> dict[Any, PyTree]:

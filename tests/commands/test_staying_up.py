@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from jaxro.commands.ending import NOT_SHOWN
 from jaxro.commands.journal import JOURNAL
 from jaxro.commands.request import Options
 from jaxro.reports.columns import TABLES
+from jaxro.reports.terminal import Spent, say_compiling, stopwatch
 from jaxro.tables import whole
 from jaxro.tables.examples import pair as example
 from jaxro.tables.fields import TableError
@@ -261,3 +263,15 @@ def test_semicolons_and_decimal_commas(table, tmp_path):
         else:
             texts = [(out / "points.csv").read_text() for out in outs]
             assert texts[0].replace("\npair,", "\nspread,") == texts[1]
+
+
+def test_the_time_for_compiling_is_told_beside_the_work():
+    spent = stopwatch()
+    with say_compiling((3, 20)), say_compiling((3, 40)):
+        time.sleep(0.2)
+    time.sleep(0.1)
+    found = spent()
+    assert 0.2 <= found.compiling < 0.3
+    assert 0.1 <= found.work < 0.2
+    assert str(Spent(2.04, 0.26)) == "2.0 s, and 0.3 s for compiling"
+    assert str(Spent(2.04, 0.04)) == "2.0 s"
