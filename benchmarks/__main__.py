@@ -9,7 +9,7 @@ import platform
 import sys
 
 from . import summary
-from .metrics import Baseline, Metric, read_baseline, table, write_baseline
+from .metrics import Baseline, Metric, Suite, read_baseline, table, write_baseline
 
 
 def machine() -> str:
@@ -51,7 +51,8 @@ def main() -> int:
     parser.add_argument(
         "--update-baseline",
         action="store_true",
-        help="write benchmarks/baseline.json and the page results.md made of it",
+        help="write the figures into benchmarks/baseline.json, those of --only alone if "
+        "given, and make results.md of it",
     )
     parser.add_argument(
         "--gate",
@@ -60,27 +61,26 @@ def main() -> int:
         "that of baseline.json",
     )
     options = parser.parse_args()
-    if options.update_baseline and (options.only or options.quick):
-        parser.error(
-            "--update-baseline needs a full run: its figures are compared with each "
-            "other"
-        )
+    if options.update_baseline and options.quick:
+        parser.error("--update-baseline needs figures of full size")
 
-    measured = []
+    measured: dict[str, Suite] = {}
     for name in options.only or suites:
         found = suites[name](QUICK if options.quick else Size())
         rows = [metric.row() for metric in found]
         # a run takes long: show what there is
         print(name, *rows, sep="\n", file=sys.stderr, flush=True)
-        measured += found
-    print(f"{machine()}\n\n{table(measured)}")
+        measured[name] = Suite(str(datetime.date.today()), found)
+    now = Baseline(machine(), measured)
+    print(f"{now.machine}\n\n{table(now.metrics)}")
 
-    worse = _worse(measured) if options.gate else []
+    worse = _worse(now.metrics) if options.gate else []
     for line in worse:
         print(line)
     if options.update_baseline:
-        baseline = Baseline(machine(), [], measured)
-        write_baseline(baseline)
+        both = read_baseline().suites | measured
+        known = {name: both[name] for name in suites if name in both}
+        write_baseline(now._replace(suites=known))
         summary.write_page(read_baseline())
     return 1 if worse else 0
 

@@ -1,5 +1,5 @@
 """One measured figure, what is promised of it, and how far it may slip; and the
-committed figures of the last full run."""
+committed figures."""
 
 import json
 import statistics
@@ -61,13 +61,23 @@ class Metric:
         )
 
 
+class Suite(NamedTuple):
+    """The figures of one suite, which are compared with each other, and their day."""
+
+    measured: str
+    metrics: list[Metric]
+
+
 class Baseline(NamedTuple):
-    """A full run: the machine in a line, remarks that hold for this run only, and all
-    figures."""
+    """The committed figures by suite, and the machine that measured last, in a line."""
 
     machine: str
-    remarks: list[str]
-    metrics: list[Metric]
+    suites: dict[str, Suite]
+
+    @property
+    def metrics(self) -> list[Metric]:
+        """All figures."""
+        return [metric for suite in self.suites.values() for metric in suite.metrics]
 
     def values(self) -> dict[str, float]:
         """The value of each figure by its key."""
@@ -86,32 +96,41 @@ def read_baseline() -> Baseline:
     """The figures of baseline.json. Tolerances are not among them: those of the code
     hold."""
     content = json.loads(BASELINE.read_text(encoding="utf-8"))
-    metrics = [
-        Metric(
-            key,
-            entry["value"],
-            entry["unit"],
-            entry["better"],
-            goal=entry.get("goal"),
+    suites = {
+        name: Suite(
+            suite["measured"], [_metric(*item) for item in suite["figures"].items()]
         )
-        for key, entry in content["metrics"].items()
-    ]
-    return Baseline(content["machine"], content["remarks"], metrics)
+        for name, suite in content["suites"].items()
+    }
+    return Baseline(content["machine"], suites)
+
+
+def _metric(key: str, entry: Mapping[str, Any]) -> Metric:
+    goal = entry.get("goal")
+    return Metric(key, entry["value"], entry["unit"], entry["better"], goal=goal)
 
 
 def write_baseline(baseline: Baseline) -> None:
     """Write baseline.json, one figure a line, so that a change of one figure changes
     one line."""
-    lines = ",\n".join(
-        f"    {_json(metric.key)}: {_json(_entry(metric))}"
-        for metric in baseline.metrics
+    suites = ",\n".join(
+        f"    {_json(name)}: {{\n"
+        f'      "measured": {_json(suite.measured)},\n'
+        f'      "figures": {{\n{_lines(suite.metrics)}\n      }}\n'
+        "    }"
+        for name, suite in baseline.suites.items()
     )
-    remarks = json.dumps(baseline.remarks, ensure_ascii=False, indent=2)
-    remarks = remarks.replace("\n", "\n  ")
     BASELINE.write_text(
-        f'{{\n  "machine": {_json(baseline.machine)},\n  "remarks": {remarks},\n'
-        f'  "metrics": {{\n{lines}\n  }}\n}}\n',
+        f'{{\n  "machine": {_json(baseline.machine)},\n'
+        f'  "suites": {{\n{suites}\n  }}\n}}\n',
         encoding="utf-8",
+    )
+
+
+def _lines(metrics: Iterable[Metric]) -> str:
+    """A line for each figure."""
+    return ",\n".join(
+        f"        {_json(metric.key)}: {_json(_entry(metric))}" for metric in metrics
     )
 
 

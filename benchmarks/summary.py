@@ -1,4 +1,4 @@
-"""results.md: a page that is made of the figures of one full run.
+"""results.md: a page that is made of the committed figures.
 
 A key reads "workload: figure". Figures of one workload are joined in a row, and those
 of several programs after each other. The section follows from the unit: lengths and
@@ -24,8 +24,8 @@ INTRODUCTION = """\
 [baseline.json](baseline.json); do not edit it. Every suite compares the answers before it measures
 times. The other programs run in the same minutes and take turns with ours: PoseLib and OpenCV in
 processes of their own, and stock `optimistix.GaussNewton` under `jit(vmap)` on the same residual.
-Times differ by half between two runs on one machine: only ratios of one run count. A goal stands in
-brackets, in bold where it is missed; [decisions.md](decisions.md) says why."""
+Times differ by half between two runs on one machine: only ratios of one suite count. A goal stands
+in brackets, in bold where it is missed; [decisions.md](decisions.md) says why."""
 
 SECTIONS = {
     "accuracy": "Accuracy: largest difference from other programs and independent fits",
@@ -45,7 +45,7 @@ class Row(NamedTuple):
 
 def page(baseline: Baseline) -> str:
     """The text of results.md."""
-    parts = [INTRODUCTION, baseline.machine, *baseline.remarks]
+    parts = [INTRODUCTION, baseline.machine, *_earlier(baseline)]
     shown = _without_details(baseline.metrics)
     for section, title in SECTIONS.items():
         rows = [_split(metric) for metric in shown if _section(metric) == section]
@@ -53,6 +53,17 @@ def page(baseline: Baseline) -> str:
             parts += [f"## {title}", _table(rows, folded=section != "answers")]
     parts += ["## Goals missed", _missed(baseline.metrics)]
     return "\n\n".join(parts) + "\n"
+
+
+def _earlier(baseline: Baseline) -> list[str]:
+    """A line for each day but the last, with the suites that were measured then."""
+    days = _grouped(baseline.suites.items(), lambda item: item[1].measured)
+    last = max(days)
+    return [
+        f"Measured {day}: {', '.join(name for name, _ in suites)}."
+        for day, suites in days.items()
+        if day != last
+    ]
 
 
 def write_page(baseline: Baseline) -> None:
