@@ -33,6 +33,9 @@ MODIFIED = "modified_ns"
 """When the files that were read were written: part of a request, by which another one
 is known, not of a summary."""
 
+CONVERSION = "converted_sha256"
+"""The SHA-256 of the Parquet table that a CSV table was converted into: likewise."""
+
 
 class Job:
     """A table of any size, what is to be done with it, and how far it is."""
@@ -109,7 +112,8 @@ class Job:
         TableError where the input is not any more what it was."""
         self._inputs.check()
         told = self._totals()
-        asked = {key: value for key, value in self.request.items() if key != MODIFIED}
+        own = MODIFIED, CONVERSION
+        asked = {key: value for key, value in self.request.items() if key not in own}
         sigma0 = self.work.units.sigma0 or None
         units = asdict(self.work.units) | {"sigma0": sigma0, "angles": "deg"}
         with whole.draft_of(self.work.folder / "summary.json") as draft:

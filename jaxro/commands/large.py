@@ -19,14 +19,14 @@ from ..batches.table_noise import PAIRS
 from ..rejection import AbstractProcedure
 from ..reports.columns import TABLES
 from ..reports.pair import table as terminal_table
-from ..reports.terminal import Spent, consoles, progress, stopwatch
+from ..reports.terminal import Spent, consoles, progress, say_what, stopwatch
 from ..tables import parquet, whole
 from ..tables.cameras import Cameras
 from ..tables.conversion import convert
 from ..tables.fields import TableError
 from ..tables.measured import to_ragged
 from . import sigma as deviation
-from .journal import JOURNAL, MODIFIED, Job, here, previous_request
+from .journal import CONVERSION, JOURNAL, MODIFIED, Job, here, previous_request
 from .request import (
     MEASURED,
     SYSTEMS,
@@ -36,7 +36,7 @@ from .request import (
     units_of,
 )
 from .solve import Task, is_good
-from .stream import CONVERTED, PART_ROWS, Work, parts
+from .stream import CONVERTED, PART_ROWS, Work, file_digest, parts
 from .tolerances import check_sigma, tolerances
 
 REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
@@ -74,7 +74,8 @@ def run(
     console, errors = consoles()
     told = "Cleaning" if procedure else "Orienting"
     with whole.claim(options.out, check_folder_name, options.force):
-        job = prepare(options, large, procedure)
+        with say_what(f"Reading {options.file} ..."):
+            job = prepare(options, large, procedure)
         with progress(errors, told, job.pairs) as tell:
             summary = _work(job, large, tell, options.force)
     show(console, job, summary, spent())
@@ -194,7 +195,8 @@ def _plan(
             )
     else:
         source = folder / CONVERTED
-        if not (large.resume and source.exists() and (folder / JOURNAL).exists()):
+        before = previous_request(folder).get(CONVERSION) if large.resume else None
+        if before is None or not source.exists() or before != file_digest(source):
             folder.mkdir(parents=True, exist_ok=True)
             convert(options.file, source, options.semicolons)
     table = parquet.Source(source, options.file, options.semicolons)
@@ -241,6 +243,8 @@ def _plan(
         units=units_of(options, table.has_sigma, system),
     )
     asked |= deviation.entry(noise)
+    if source != options.file:
+        asked[CONVERSION] = file_digest(source)
     return Job(work, pieces, options.out.resolve(), asked, inputs)
 
 

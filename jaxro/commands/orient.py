@@ -17,7 +17,7 @@ from ..rejection import AbstractProcedure
 from ..reports import files, pair as report, reliability
 from ..reports.columns import TABLES, Units
 from ..reports.model import Results, find_patterns
-from ..reports.terminal import consoles, progress
+from ..reports.terminal import consoles, progress, say_what
 from ..reports.verdicts import Verdicts
 from ..tables import csv as tables, whole
 from ..tables.measured import CameraPairs, Table, to_ragged
@@ -86,7 +86,8 @@ def prepare(
     if options.file is None:
         table = tables.parse(otherwise.table, otherwise.name, otherwise.name)
     else:
-        table = tables.read(options.file, options.semicolons)
+        with say_what(f"Reading {options.file} ..."):
+            table = tables.read(options.file, options.semicolons)
     known = read_cameras(options, otherwise)
     check_numbers(options, table.has_sigma, table.file, system)
     sigma_known = table.has_sigma or options.sigma is not None

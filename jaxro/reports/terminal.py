@@ -211,24 +211,30 @@ LEAST_TOLD = 0.05
 
 @contextmanager
 def say_compiling(shape: tuple[int, ...]) -> Iterator[None]:
-    """Around a compilation for pairs of this shape: a line on the terminal if it takes
-    longer than SOON."""
+    """Around a compilation for pairs of this shape, whose time is measured: a line on
+    the terminal if it takes long."""
     *pairs, points = shape or (0,)
     of = f"{pairs[0]} pairs of up to " if pairs and pairs[0] > 1 else ""
     once = ", once on this machine" if store.active() else ""
-    line = f"Compiling for {of}{points} points{once} ..."
-    with _compiling.one():
-        if sys.stderr is None or not sys.stderr.isatty():
-            yield
-            return
-        say = lambda: print(line, file=sys.stderr, flush=True)
-        timer = threading.Timer(SOON, say)
-        timer.daemon = True
-        timer.start()
-        try:
-            yield
-        finally:
-            timer.cancel()
+    with _compiling.one(), say_what(f"Compiling for {of}{points} points{once} ..."):
+        yield
+
+
+@contextmanager
+def say_what(line: str) -> Iterator[None]:
+    """Around a work that nothing tells of: the line on the terminal if it takes longer
+    than SOON."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield
+        return
+    say = lambda: print(tell(line), file=sys.stderr, flush=True)
+    timer = threading.Timer(SOON, say)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 @contextmanager

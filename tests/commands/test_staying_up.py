@@ -17,6 +17,7 @@ from jaxro.commands import large, orient
 from jaxro.commands.ending import NOT_SHOWN
 from jaxro.commands.journal import JOURNAL
 from jaxro.commands.request import Options
+from jaxro.commands.stream import CONVERTED
 from jaxro.reports.columns import TABLES
 from jaxro.reports.terminal import Spent, say_compiling, stopwatch
 from jaxro.tables import whole
@@ -144,8 +145,8 @@ def test_input_that_changes_meanwhile_is_noticed(parquet, table, tmp_path, monke
 
 
 def test_damaged_parts_are_made_anew(tmp_path, monkeypatch):
-    """Whatever byte of a finished part or of the journal is another one: the results
-    are the same."""
+    """Whatever byte of a finished part, of the journal, or of the converted table that
+    a part is made anew from, is another one: the results are the same."""
     pytest.importorskip("pyarrow")
     header, *points = example.TABLE.splitlines()
     source = tmp_path / "pairs.csv"
@@ -177,19 +178,22 @@ def test_damaged_parts_are_made_anew(tmp_path, monkeypatch):
     journal = unfinished / JOURNAL
     second_line = kept[journal].index(b"\n") + 20
     size = len(kept[part])
-    damages = [(part, at) for at in (0, 5, size // 2, size - 1)]
-    damages += [(journal, second_line + 30 * k) for k in range(4)]
-    for path, at in damages:
+    damages = [{part: at} for at in (0, 5, size // 2, size - 1)]
+    damages += [{journal: second_line + 30 * k} for k in range(4)]
+    converted = unfinished / CONVERTED
+    damages += [{part: 5, converted: len(kept[converted]) // k} for k in (2, 3, 4)]
+    for number, places in enumerate(damages):
         for file, content in kept.items():
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(content)
-        content = bytearray(kept[path])
-        content[at] ^= 1
-        path.write_bytes(content)
+        for path, at in places.items():
+            content = bytearray(kept[path])
+            content[at] ^= 1
+            path.write_bytes(content)
         assert work(True, options.out)
         found = {path.name: path.read_bytes() for path in options.out.rglob("*.*")}
         assert found == expected
-        os.rename(options.out, tmp_path / f"done{at}{path.name}")
+        os.rename(options.out, tmp_path / f"done{number}")
 
     unfinished.mkdir(exist_ok=True)
     for content in (
