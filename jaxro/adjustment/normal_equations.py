@@ -191,12 +191,25 @@ def inverse(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
         full, pivots = symmetric.inverse(dense(n))
         return [[full[i, j] for j in range(i + 1)] for i in range(p)], jnp.min(pivots)
     factor, pivot = cholesky(n)
-    zero, one = jnp.zeros_like(n[0][0]), jnp.ones_like(n[0][0])
-    solved = [
-        substitute(factor, [one if i == k else zero for i in range(p)])
-        for k in range(p)
-    ]
-    return [[solved[j][i] for j in range(i + 1)] for i in range(p)], pivot
+    lower = _inverse_of_lower(factor)
+    column = lambda i, first: [row[i] for row in lower[first:]]
+    product = lambda i, j: _dot(column(i, i), column(j, i))
+    return [[product(i, j) for j in range(i + 1)] for i in range(p)], pivot
+
+
+def _inverse_of_lower(factor: Lower) -> Lower:
+    """L⁻¹, from L with the inverses of its diagonal."""
+    lower: list[list[Scalar]] = []
+    for i, row in enumerate(factor):
+        above = lambda j, row=row, i=i: _dot(row[j:i], [r[j] for r in lower[j:i]])
+        lower.append([*(-row[i] * above(j) for j in range(i)), row[i]])
+    return lower
+
+
+def _dot(a: Scalars, b: Scalars) -> Any:
+    """Σ a b"""
+    products = [x * y for x, y in zip(a, b, strict=True)]
+    return sum(products[1:], products[0])
 
 
 class GaussNewton(optx.AbstractLeastSquaresSolver):
