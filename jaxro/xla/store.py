@@ -3,9 +3,10 @@
 Off unless a caller names a folder (`use`): the command line does, a library call writes
 nothing. A program is found again by everything it depends on: the source of this
 package, the versions of those it stands on, the processor, the compiler settings, the
-static options and the shapes. The files are pickles, which may do anything when they
-are read: a folder that others may write to, or that belongs to somebody else, is not
-used, links are not followed, and a file counts only if it is the user's own and whole.
+static options and the shapes. The files hold machine code, which may do anything when
+it runs, as the pickles around it may when they are read: a folder that others may write
+to, or that belongs to somebody else, is not used, links are not followed, and a file
+counts only if it is the user's own and whole.
 """
 
 import hashlib
