@@ -185,31 +185,33 @@ def correction(
 
 
 def inverse(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
-    """The lower triangle of N⁻¹ and the smallest relative pivot."""
+    """The lower triangle of N⁻¹ and the smallest relative pivot; of many matrices at
+    once where the entries are arrays."""
     p = len(n)
     if p > UNROLLED:
         full, pivots = symmetric.inverse(dense(n))
         return [[full[i, j] for j in range(i + 1)] for i in range(p)], jnp.min(pivots)
     factor, pivot = cholesky(n)
     lower = _inverse_of_lower(factor)
-    column = lambda i, first: [row[i] for row in lower[first:]]
-    product = lambda i, j: _dot(column(i, i), column(j, i))
-    return [[product(i, j) for j in range(i + 1)] for i in range(p)], pivot
+
+    def entry(i: int, j: int) -> Any:
+        """Of L⁻ᵀ L⁻¹, i >= j."""
+        rows = lower[i:]
+        return sum((row[i] * row[j] for row in rows[1:]), rows[0][i] * rows[0][j])
+
+    return [[entry(i, j) for j in range(i + 1)] for i in range(p)], pivot
 
 
 def _inverse_of_lower(factor: Lower) -> Lower:
     """L⁻¹, from L with the inverses of its diagonal."""
-    lower: list[list[Scalar]] = []
+    rows: list[list[Scalar]] = []
     for i, row in enumerate(factor):
-        above = lambda j, row=row, i=i: _dot(row[j:i], [r[j] for r in lower[j:i]])
-        lower.append([*(-row[i] * above(j) for j in range(i)), row[i]])
-    return lower
-
-
-def _dot(a: Scalars, b: Scalars) -> Any:
-    """Σ a b"""
-    products = [x * y for x, y in zip(a, b, strict=True)]
-    return sum(products[1:], products[0])
+        new: list[Scalar] = []
+        for j in range(i):
+            products = [row[k] * rows[k][j] for k in range(j, i)]
+            new.append(-row[i] * sum(products[1:], products[0]))
+        rows.append([*new, row[i]])
+    return rows
 
 
 class GaussNewton(optx.AbstractLeastSquaresSolver):

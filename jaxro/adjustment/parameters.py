@@ -47,8 +47,8 @@ class AbstractParameters(eqx.Module):
         dtype = jax.tree.leaves(self)[0].dtype
         return (jnp.zeros((), dtype),) * self.count
 
-    def moved(self, x: Step) -> "AbstractParameters":
-        """The parameters after a step x, or as they are if x is empty."""
+    def at(self, x: Step) -> "AbstractParameters":
+        """The parameters at the displacement x, as they are if x is empty."""
         return self.move(x) if x else self
 
     def slopes(

@@ -30,7 +30,7 @@ class Residuals(eqx.Module):
     def shared(self, *x: Array) -> PyTree:
         """θ(x): what `prepare` makes of the parameters, or the parameters
         themselves."""
-        parameters = self.centre.moved(x)
+        parameters = self.centre.at(x)
         if self.term.prepare is None:
             return as_given(parameters)
         return self._prepare(*parameters.arguments())

@@ -187,7 +187,7 @@ def _plan(
     """The job that is asked for; a CSV table is converted first."""
     assert options.file is not None and options.out is not None
     inputs = whole.Inputs(options.file, options.camera)
-    source = options.file
+    source, digest = options.file, None
     if whole.is_parquet(source):
         if options.semicolons:
             raise TableError(
@@ -196,9 +196,11 @@ def _plan(
     else:
         source = folder / CONVERTED
         before = previous_request(folder).get(CONVERSION) if large.resume else None
-        if before is None or not source.exists() or before != file_digest(source):
+        digest = file_digest(source) if before and source.exists() else None
+        if digest is None or digest != before:
             folder.mkdir(parents=True, exist_ok=True)
             convert(options.file, source, options.semicolons)
+            digest = file_digest(source)
     table = parquet.Source(source, options.file, options.semicolons)
     system = SYSTEMS[options.elements or "relative"]
     check_numbers(options, table.has_sigma, str(options.file), system)
@@ -243,8 +245,8 @@ def _plan(
         units=units_of(options, table.has_sigma, system),
     )
     asked |= deviation.entry(noise)
-    if source != options.file:
-        asked[CONVERSION] = file_digest(source)
+    if digest is not None:
+        asked[CONVERSION] = digest
     return Job(work, pieces, options.out.resolve(), asked, inputs)
 
 

@@ -163,7 +163,7 @@ class RelativePose(AbstractElements):
         """The right photo turns about its own axes: R [e_k]x is R with two columns
         exchanged, one of them negative, and the third zero. The base moves by its
         stereographic coordinates."""
-        rotation, base = self.moved(x).arguments()
+        rotation, base = self.at(x).arguments()
 
         def along(argument: int, direction: Any) -> Any:
             at = [rotation, base]
@@ -184,7 +184,7 @@ class RelativePose(AbstractElements):
             slopes.append(along(0, turning))
         first = self.bx, self.by, self.bz
         for number, tangent in enumerate(rot.tangents(first), 3):
-            # the centre of the projection is half of x away from the base that moved
+            # d/du of the base in `move`, (1 - u²/4 - v²/4) b + u q + v r
             moving = rot.add_scaled(tangent, first, -x[number] / 2) if x else tangent
             slopes.append(along(1, moving))
         return function(rotation, base), slopes

@@ -35,6 +35,10 @@ NEAR_STEPS = 10
 five."""
 
 
+Unchecked = tuple[Orientation, Bool[Array, ""]]
+"""An orientation, and whether `check_plane` is still to come."""
+
+
 def orient(
     pair: Pair,
     *,
@@ -82,19 +86,24 @@ def orient(
             problem = problem._replace(tolerance=FOR_CALLERS)
         return Program(orient_once, {"problem": problem})(pair)
     points = pair.x_left.size
-    # small programs instead of a large one: the general start, and the check of points
-    # in a plane, are compiled when a pair first needs them
-    fits = False
-    if isinstance(start, starts.Auto):
-        (orientation, asked), fits = _run(orient_near, pair, problem, one_kernel)
-        problem = problem.starting(start.general)
-    if not bool(fits):
-        orientation, asked = _run(orient_unchecked, pair, problem, kernels_of_parts)
-    if bool(asked):  # pyright: ignore[reportPossiblyUnboundVariable]
+    orientation, asked = _orient_in_parts(pair, problem)
+    if bool(asked):
         pair = pad(pair, orientation.parallax.size)
         program = Program(_check, {}, settings_for(pair.x_left.size))
         orientation = program((pair, (orientation, asked)))
     return orientation.first(points)
+
+
+def _orient_in_parts(pair: Pair, problem: Problem) -> Unchecked:
+    """The orientation but for `check_plane`, by small programs instead of a large one:
+    the general start, and that check, are compiled when a pair first needs them."""
+    start = problem.start
+    if isinstance(start, starts.Auto):
+        unchecked, fits = _run(orient_near, pair, problem, one_kernel)
+        if bool(fits):
+            return unchecked
+        problem = problem.starting(start.general)
+    return _run(orient_unchecked, pair, problem, kernels_of_parts)
 
 
 def _run(function: Callable, pair: Pair, problem: Problem, kernel: Callable) -> Any:
@@ -108,10 +117,6 @@ def _run(function: Callable, pair: Pair, problem: Problem, kernel: Callable) -> 
     options = {"problem": problem}
     program = Program(function, options, settings, kernel=kernel if as_kernel else None)
     return program(pair)
-
-
-Unchecked = tuple[Orientation, Bool[Array, ""]]
-"""An orientation, and whether `check_plane` is still to come."""
 
 
 def _check(data: tuple[Pair, Unchecked]) -> Orientation:

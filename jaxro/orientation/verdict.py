@@ -110,6 +110,7 @@ def check_plane(
     """The orientation with the result `two_solutions` where that is `asked` and the
     second pose, which exists if the points lie in a plane, fits them as well; whether
     they do, its Σ r² tells. Few pairs are asked."""
+    # a verdict has no derivative
     pair, pose = lax.stop_gradient((mask_unusable(pair)[0], orientation.pose))
     squares = planes.second_squares(pair, pose, asked)
     n = jnp.maximum(pair.count, 1.0)
