@@ -30,17 +30,17 @@ def order_by_neighbours(
     points = rows.astype(jnp.float32)
     there = jnp.arange(len(rows), dtype=of.dtype) < of
     use = there.astype(jnp.float32)
-    others, taken = points[::step], use[::step]
+    # one array for each coordinate, so that the compiler works on many points at once
+    others, taken = points[::step].T, use[::step]
     some = jnp.maximum(jnp.sum(taken), 1.0)
     near_left = CLOSE**2 * _spread(points[:, :2], use) / some
     near_right = CLOSE**2 * _spread(points[:, 2:], use) / some
 
     def agreement(point):
-        square = (others - point[None, :]) ** 2
-        left = jnp.sum(square[:, :2], axis=1)
-        right = jnp.sum(square[:, 2:], axis=1)
-        near = taken / (1 + left / near_left) ** 2
-        both = near / (1 + right / near_right) ** 2
+        x, y, u, v = ((a - b) ** 2 for a, b in zip(others, point, strict=True))
+        left, right = 1 + (x + y) / near_left, 1 + (u + v) / near_right
+        near = taken / (left * left)
+        both = near / (right * right)
         neighbours = jnp.maximum(jnp.sum(near), 1e-6)
         return jnp.sum(both) / neighbours
 

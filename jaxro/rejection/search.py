@@ -15,8 +15,8 @@ and replaces the best so far if it costs less. The search ends when a better ori
 a larger share p of the points, would have been met with the probability `confidence`:
 after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
 
-Of many points every second block draws from the points whose neighbours agree best
-(`neighbours`). This changes only the order in which orientations are met: the cost does
+Of many points every second block from the third on draws from the points whose
+neighbours agree best (`neighbours`), whose order is computed then. This changes only the order in which orientations are met: the cost does
 not depend on it, and these blocks do not count for the confidence.
 """
 
@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
-from ..xla.kernels import while_loop
+from ..xla.kernels import if_needed, while_loop
 from ..xla.passes import count
 from . import five_points
 from .agreement import points_within, squares
@@ -54,8 +54,9 @@ PER_SUBSET = 2
 """Orientations that are compared, at most, for each subset on the average of a
 block."""
 
-GUIDED = 24
-"""Blocks of which every second one is drawn from the points whose neighbours agree."""
+FIRST_GUIDED, GUIDED = 2, 24
+"""The first block that is drawn from the points whose neighbours agree, and the number
+of blocks of which every second one then is."""
 
 FINE = 0.25
 """Multiple of sigma within which points are about equally near."""
@@ -69,6 +70,11 @@ SMALLEST_FRONT = 12
 CLEARLY = 0.5
 """An orientation lost clearly if fewer than this part of the points agree that agree
 with the best of its block."""
+
+
+Order = Int[Array, "point"] | None
+"""The places of the points, those first whose neighbours agree best; None where
+neighbours are not asked."""
 
 
 class Found(NamedTuple):
@@ -105,13 +111,25 @@ def nothing_found(pose: RelativePose) -> Found:
 
 class Sample(NamedTuple):
     """The points of a pair for a search: coordinates and sigma of those that take part,
-    before all others; how many they are; and their order by neighbours, if it is
-    used."""
+    before all others, and how many they are."""
 
     rows: Float[Array, "point 4"]
     sigma: Float[Array, "point"]
     of: Float[Array, ""]
-    order: Int[Array, "point"] | None
+
+    @property
+    def has_neighbours(self) -> bool:
+        """Whether there are points enough that neighbours may say something."""
+        return len(self.rows) >= ENOUGH
+
+    def update_order(
+        self, order: Int[Array, "point"], needed: Bool[Array, ""]
+    ) -> Int[Array, "point"]:
+        """The order by neighbours where it is needed, else the one there is."""
+        rank = lambda needed: order_by_neighbours(
+            self.rows, jnp.where(needed, self.of, 0.0)
+        )
+        return if_needed(needed, rank, order)
 
 
 class Search(eqx.Module):
@@ -145,14 +163,22 @@ class Search(eqx.Module):
         """The search, continued until it is enough, or until as many subsets as it is
         `worth` have been solved."""
         most = -(-self.count // self.block)
-        sample = _sample(pair, guided=most > 1)
+        sample = _sample(pair)
+        guided = sample.has_neighbours and most > FIRST_GUIDED
 
-        def more(found: Found) -> Bool[Array, ""]:
+        def more(state: tuple[Found, Order]) -> Bool[Array, ""]:
+            found, _ = state
             wanted = jnp.minimum(found.enough, worth)
             return (found.blocks < most) & (found.counted < wanted)
 
-        step = lambda found: self._search_block(pair, sample, found)
-        return while_loop(more, step, found, pair.focal_left)
+        def step(state: tuple[Found, Order]) -> tuple[Found, Order]:
+            found, order = state
+            if order is not None:
+                order = sample.update_order(order, found.blocks == FIRST_GUIDED)
+            return self._search_block(pair, sample, order, found), order
+
+        order = jnp.arange(len(sample.rows)) if guided else None
+        return while_loop(more, step, (found, order), pair.focal_left)[0]
 
     def enough_for(
         self, agree: Float[Array, ""], of: Float[Array, ""]
@@ -169,10 +195,12 @@ class Search(eqx.Module):
         enough = self.enough_for(agree, count(pair.mask))
         return jnp.where(forward(pose), jnp.maximum(enough, FORWARD), enough)
 
-    def _search_block(self, pair: Pair, sample: Sample, found: Found) -> Found:
+    def _search_block(
+        self, pair: Pair, sample: Sample, order: Order, found: Found
+    ) -> Found:
         """The state after one more block of subsets."""
         wide = self.limit * self.margin
-        poses, exist = self._solve_block(pair, sample, found.blocks)
+        poses, exist = self._solve_block(pair, sample, order, found.blocks)
         first = _compare(pair, sample, poses, self.judges, wide)
         new = self._best(pair, poses, exist, first.cost)
         new = improve_within(pair, new, self.limit, self.margin, self.steps)
@@ -185,7 +213,7 @@ class Search(eqx.Module):
         lost = exist & (first.agree < CLEARLY * most)
         # the five points of a subset agree with its orientations in any case
         own = 5 * first.asked / jnp.maximum(sample.of, 1.0)
-        guided = self._is_guided(found.blocks) & (sample.order is not None)
+        guided = self._is_guided(found.blocks) & (order is not None)
         return Found(
             pose=pose,
             cost=jnp.where(better, new_cost, found.cost),
@@ -213,17 +241,19 @@ class Search(eqx.Module):
         return best(finalists, jnp.where(exist[chosen], costs, jnp.inf))
 
     def _is_guided(self, block: Int[Array, ""]) -> Bool[Array, ""]:
-        return (block < GUIDED) & (block % 2 == 1)
+        return (block >= FIRST_GUIDED) & (block < GUIDED) & (block % 2 == 0)
 
-    def _solve_block(self, pair: Pair, sample: Sample, block: Int[Array, ""]) -> Poses:
+    def _solve_block(
+        self, pair: Pair, sample: Sample, order: Order, block: Int[Array, ""]
+    ) -> Poses:
         """The orientations of a block of subsets."""
         key = jax.random.fold_in(jax.random.key(self.seed), block)
         uniform = jax.random.uniform(key, (5, self.block), jnp.float32)
-        of, order = sample.of, sample.order
+        of = sample.of
         if order is None:
             places = choose_places(uniform, of)
         else:
-            halvings = 1 + (block // 2) % FRONTS
+            halvings = 1 + (block // 2 - 1) % FRONTS
             front = jnp.maximum(
                 of * 0.5 ** halvings.astype(of.dtype), float(SMALLEST_FRONT)
             )
@@ -267,15 +297,12 @@ def _point_cost(
     return jnp.log1p(cut / FINE**2)
 
 
-def _sample(pair: Pair, guided: bool) -> Sample:
-    """The points of a pair for a search of blocks that are `guided` by neighbours, if
-    there are ENOUGH of them."""
-    rows, of = move_up_coordinates(pair), count(pair.mask)
-    order = None
-    if guided and len(rows) >= ENOUGH:
-        order = order_by_neighbours(rows, of)
+def _sample(pair: Pair) -> Sample:
+    """The points of a pair for a search."""
     return Sample(
-        rows=rows, sigma=move_up(pair, pair.sigma, fill=1.0), of=of, order=order
+        rows=move_up_coordinates(pair),
+        sigma=move_up(pair, pair.sigma, fill=1.0),
+        of=count(pair.mask),
     )
 
 
