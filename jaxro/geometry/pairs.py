@@ -253,12 +253,9 @@ def pad(one: Pair, points: int) -> Pair:
 
 
 def room_for(points: int) -> int:
-    """The places that a single pair of so many points is padded to: 8, 12, 16, 24, 32,
-    48, ... A program is compiled for a number of places, not for each of points."""
-    size = 8
-    while size < points:
-        size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
-    return size
+    """The places that a single pair of so many points is padded to: 16, 32, 64, ... A
+    program is compiled for a number of places, not for each of points."""
+    return max(16, 1 << (points - 1).bit_length())
 
 
 def first_points(tree: PyTree, points: int) -> PyTree:
