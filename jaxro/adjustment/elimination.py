@@ -178,16 +178,15 @@ def accumulate(
     for term, part in zip(terms, parts, strict=True):
         own, kept = _divided(layout, term, part)
         for name, member, a in kept:
-            if (
-                layout[name].members == 1 and len(kept) == 1
-            ):  # all groups touch one block: one product of matrices
-                place = layout.places(name, jnp.zeros((), int))
-                n = n.at[jnp.ix_(place, place)].add(jnp.einsum("gmi,gmj->ij", a, a))
-                h = h.at[place].add(jnp.einsum("gmi,gm->i", a, part.residuals))
-                continue
-            rows = layout.places(name, member)
-            h = h.at[rows].add(jnp.einsum("gmi,gm->gi", a, part.residuals))
+            rows, alone = layout.places(name, member), layout[name].members == 1
+            own_h = jnp.einsum("gmi,gm->gi", a, part.residuals)
+            h = h.at[rows[0]].add(jnp.sum(own_h, 0)) if alone else h.at[rows].add(own_h)
             for other, of_other, b in kept:
+                if alone and layout[other].members == 1:
+                    # one block for all groups: one product of matrices
+                    places = rows[0], layout.places(other, of_other)[0]
+                    n = n.at[jnp.ix_(*places)].add(jnp.einsum("gmi,gmj->ij", a, b))
+                    continue
                 columns = layout.places(other, of_other)
                 n = n.at[rows[:, :, None], columns[:, None, :]].add(
                     jnp.einsum("gmi,gmj->gij", a, b)
@@ -224,6 +223,31 @@ def _divided(layout: Layout, term: Term, part: Linearised) -> tuple[list, list]:
     ]
     own = [entry for entry in touched if layout.is_eliminated(entry[0])]
     return own, [entry for entry in touched if not layout.is_eliminated(entry[0])]
+
+
+def damp(normals: Normals, damping: Float[Array, ""]) -> Normals:
+    """The normal equations, the diagonal of which is larger by the part `damping`."""
+    n, h, sums = normals
+    n = n + jnp.diag(damping * jnp.diagonal(n))
+    if sums is not None:
+        diagonal = jnp.diagonal(sums.v, axis1=1, axis2=2)
+        unit = jnp.eye(sums.v.shape[1], dtype=n.dtype)
+        sums = sums._replace(v=sums.v + damping * diagonal[:, :, None] * unit[None])
+    return Normals(n, h, sums)
+
+
+def along(
+    normals: Normals, kept: Vector, eliminated: Float[Array, "block d"] | None
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Of a step dx: hᵀ dx and dxᵀ diag(N) dx, the eliminated blocks included."""
+    n, h, sums = normals
+    product = jnp.sum(h * kept)
+    squares = jnp.sum(jnp.diagonal(n) * kept**2)
+    if sums is None or eliminated is None:
+        return product, squares
+    diagonal = jnp.diagonal(sums.v, axis1=1, axis2=2)
+    product = product + jnp.sum(sums.g * eliminated)
+    return product, squares + jnp.sum(diagonal * eliminated**2)
 
 
 class Carried(NamedTuple):
@@ -283,7 +307,7 @@ def _kept(
     n = n * scale[:, None] * scale[None, :]
     h = h * scale
     if constraint is None:
-        q, left = symmetric.inverse(n)
+        q, left = _inverse(n)
         step, pivots = q @ h, left * jnp.diagonal(n)
     else:
         # N + CᵀC is regular where N is not but the constraints fix what it leaves open;
@@ -299,6 +323,16 @@ def _kept(
         q = q - border @ inverse @ border.T
         pivots = jnp.concatenate([left, of_rows])
     return q * scale[:, None] * scale[None, :], step * scale, pivots
+
+
+def _inverse(matrix: Matrix) -> tuple[Matrix, Float[Array, " some"]]:
+    """The inverse of the kept parameters' matrix and its pivots; of a few parameters
+    element by element, which batches well."""
+    if len(matrix) > normal.UNROLLED:
+        return symmetric.inverse(matrix)
+    rows = [[matrix[i, j] for j in range(i + 1)] for i in range(len(matrix))]
+    lower, pivot = normal.inverse(rows)
+    return normal.dense(lower), pivot[None]
 
 
 def _inverses(
@@ -340,6 +374,13 @@ def redundancies(
     taken = jnp.zeros_like(part.residuals)
     for name, member, a in kept:
         for other, of_other, b in kept:
+            if layout[name].members == layout[other].members == 1:
+                # one block for all groups: no copy of it for each
+                first = jnp.zeros((), int)
+                rows, columns = layout.places(name, first), layout.places(other, first)
+                q = solution.cofactor[jnp.ix_(rows, columns)]
+                taken = taken + jnp.einsum("gmi,ij,gmj->gm", a, q, b)
+                continue
             rows, columns = (
                 layout.places(name, member)[:, :, None],
                 layout.places(other, of_other)[:, None],

@@ -22,6 +22,7 @@ from .blocks import (
 )
 from .elimination import Layout, Solution
 from .guarded import root, times
+from .levenberg_marquardt import DampedStep, promised
 from .losses import AbstractLoss
 from .m_estimates import spread
 from .results import RESULTS
@@ -87,6 +88,19 @@ class Joint(eqx.Module):
         blocks = found.eliminated
         return self.layout.divided(found.step, None if blocks is None else blocks.steps)
 
+    def damped(self, steps: Steps, damping: Float[Array, ""]) -> DampedStep:
+        """What Levenberg-Marquardt subtracts from the displacements."""
+        parts = [_weight(part, self.loss) for part in self.linearise(steps)]
+        normals = elimination.accumulate(self.layout, self.terms, parts)
+        found = elimination.solve(
+            elimination.damp(normals, damping), self._constraint(steps)
+        )
+        blocks = found.eliminated
+        of_blocks = None if blocks is None else blocks.steps
+        decrement, spread = elimination.along(normals, found.step, of_blocks)
+        step = self.layout.divided(found.step, of_blocks)
+        return promised(step, decrement, damping, spread)
+
     def further(self, steps: Steps, step: Steps) -> Steps:
         """The displacements followed by a step."""
         return jax.tree.map(jnp.add, steps, step)
@@ -142,8 +156,11 @@ def adjust_jointly(
                 f"adjust: the start of family {name!r} has a single number; each number "
                 "of a block is an array over all blocks of the family"
             )
-    # the optimum does not depend on where it is sought
-    families = jax.lax.stop_gradient(families)
+    # the optimum does not depend on where it is sought; family by family, because JAX
+    # would sort them by name
+    families = {
+        name: jax.lax.stop_gradient(family) for name, family in families.items()
+    }
     layout = elimination.layout(families, terms, eliminate)
     terms = tuple(close_blocks(term, families) for term in terms)
     joint = Joint(terms, families, layout, constraints, loss)

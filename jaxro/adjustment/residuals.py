@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from . import normal_equations as normal
+from .levenberg_marquardt import DampedStep, promised
 from .losses import AbstractLoss
 from .parameters import AbstractParameters, as_given
 from .terms import Term, discrepancy, whiten
@@ -41,6 +42,17 @@ class Residuals(eqx.Module):
     def correction(self, x: tuple[Array, ...]) -> tuple[Array, ...]:
         """What Gauss-Newton subtracts from the displacement."""
         return normal.correction(self.columns(x))
+
+    def damped(self, x: tuple[Array, ...], damping: Float[Array, ""]) -> DampedStep:
+        """What Levenberg-Marquardt subtracts from the displacement."""
+        n, h, _ = normal.accumulate(*self.columns(x))
+        diagonal = [row[-1] for row in n]
+        larger = [[*row[:-1], row[-1] * (1 + damping)] for row in n]
+        step = tuple(normal.solve(larger, h))
+        of_all, moved = jnp.stack(list(h)), jnp.stack(list(step))
+        decrement = jnp.sum(of_all * moved)
+        spread = jnp.sum(jnp.stack(diagonal) * moved**2)
+        return promised(step, decrement, damping, spread)
 
     def further(
         self, x: tuple[Array, ...], step: tuple[Array, ...]

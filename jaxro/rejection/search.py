@@ -16,8 +16,9 @@ a larger share p of the points, would have been met with the probability `confid
 after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
 
 Of many points every second block from the third on draws from the points whose
-neighbours agree best (`neighbours`), whose order is computed then. This changes only the order in which orientations are met: the cost does
-not depend on it, and these blocks do not count for the confidence.
+neighbours agree best (`neighbours`), whose order is computed then. This changes only
+the order in which orientations are met: the cost does not depend on it, and these
+blocks do not count for the confidence.
 """
 
 import math

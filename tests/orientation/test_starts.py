@@ -11,13 +11,13 @@ import problems
 import pytest
 
 import jaxro
+from jaxro.adjustment.null_space import null_space
 from jaxro.geometry import coplanarity, rotations as rot
 from jaxro.geometry.elements import IndependentElements, vertical
 from jaxro.orientation.starts import SixPoints, decomposition, six_points
 from jaxro.orientation.starts.base import FirstOrder, approach
 from jaxro.orientation.starts.eight_point import eight_point
 from jaxro.orientation.starts.five_point import five_point
-from jaxro.orientation.starts.null_space import null_space
 
 BATCH = 2048
 five_points = jax.jit(jax.vmap(five_point))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .null_space import null_space
+from ...adjustment.null_space import null_space
 from .problems_last import problems_last
 
 TINY = 1e-300

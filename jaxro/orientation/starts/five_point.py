@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .null_space import null_space, reflected, reflector
+from ...adjustment.null_space import null_space, reflected, reflector
 from .problems_last import cross, problems_last
 
 TINY = 1e-300

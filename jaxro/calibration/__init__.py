@@ -1,0 +1,30 @@
+"""Self-calibration of images by zones, by a displacement field or by Brown's
+coefficients (Yurchenko 2002, and beyond)."""
+
+from .brown import Brown as Brown
+from .calibrate import calibrate as calibrate
+from .camera import perspective as perspective, stereographic as stereographic
+from .choice import (
+    Comparison as Comparison,
+    choose as choose,
+    compare as compare,
+    default_models as default_models,
+)
+from .field import Field as Field
+from .images import MeasuredImage as MeasuredImage, image as image
+from .known import Known as Known, known as known
+from .models import Model as Model
+from .pieces import Pieces as Pieces, pieces as pieces
+from .result import Calibration as Calibration
+from .results import RESULTS as RESULTS, is_usable as is_usable
+from .zones import (
+    AbstractZones as AbstractZones,
+    Numbered as Numbered,
+    Rectangles as Rectangles,
+    Rings as Rings,
+    Whole as Whole,
+    rectangles as rectangles,
+    rings as rings,
+    strips_along_x as strips_along_x,
+    strips_along_y as strips_along_y,
+)

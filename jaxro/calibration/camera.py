@@ -1,0 +1,126 @@
+"""The camera that took an image, and the condition between a place and its object
+point.
+
+    m = t + A(m) a + W(m) f ∘ p - Brown(m - t; k),    p = (Xc/Zc, Yc/Zc),  Xc = R (X - S)
+
+Station S and rotation R; t, the principal place; the focal lengths f by zones, of which
+W(m) are the weights along x and along y; Brown's coefficients k; the coefficients a of
+a displacement field. W and A are looked up at the measured place once, so that the way
+from a place to its ray is explicit: p = (m - t - A a + Brown) / W f.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..adjustment import AbstractParameters
+from ..geometry import rotations as rot
+from .brown import corrections
+from .images import Pair
+
+Vector = Float[Array, "3"]
+
+
+class Station(AbstractParameters):
+    """Where the camera stood and how it was turned: the projection centre, and the unit
+    quaternion of R, object to camera (x to the right, y down, z forward).
+
+    Its six local parameters are half a rotation vector in the camera's axes, which
+    enters as the vector part of a quaternion (1, w/2), and the three coordinates.
+    """
+
+    quaternion: Float[Array, "4"]
+    centre: Vector
+
+    @property
+    def count(self) -> int:
+        return 6
+
+    def move(self, step) -> "Station":
+        w, x, y, z = (self.quaternion[k] for k in range(4))
+        a, b, c = (step[k] / 2 for k in range(3))
+        turned = jnp.stack(
+            [
+                w - a * x - b * y - c * z,
+                x + a * w + b * z - c * y,
+                y + b * w + c * x - a * z,
+                z + c * w + a * y - b * x,
+            ]
+        )
+        return Station(turned, self.centre + jnp.stack([step[k] for k in (3, 4, 5)]))
+
+    def normalise(self) -> "Station":
+        length = jnp.sqrt(jnp.sum(self.quaternion**2))
+        sign = jnp.where(self.quaternion[0] < 0, -1.0, 1.0)
+        return Station(self.quaternion * sign / length, self.centre)
+
+    def to_camera(self, point: Vector) -> rot.Vector:
+        """R (X - S), times the squared length of the quaternion."""
+        apart = point - self.centre
+        turn = rot.from_quaternion(*(self.quaternion[k] for k in range(4)))
+        return rot.apply(turn, (apart[0], apart[1], apart[2]))
+
+
+class Camera(eqx.Module):
+    """The inner orientation and the distortion of an image, in the units of its
+    frame. `brown` has seven coefficients or none."""
+
+    principal: Pair
+    focal: Float[Array, " zone"]
+    brown: Float[Array, " coefficient"]
+    field: Float[Array, " mode"]
+
+
+class Measured(NamedTuple):
+    """One measured point: its place, its object coordinates, and the weights of the
+    focal lengths and of the field's coefficients there, for x and for y."""
+
+    place: Pair
+    point: Vector
+    focal: Float[Array, "2 zone"]
+    field: Float[Array, "2 mode"]
+
+
+Rays = Callable[[rot.Vector], tuple[Array, Array]]
+
+
+def perspective(ray: rot.Vector) -> tuple[Array, Array]:
+    """Xc/Zc, Yc/Zc; infinite behind the camera."""
+    x, y, z = ray
+    ahead = z > 0
+    safe = jnp.where(ahead, z, 1.0)
+    behind = lambda value: jnp.where(ahead, value / safe, jnp.inf)
+    return behind(x), behind(y)
+
+
+def stereographic(ray: rot.Vector) -> tuple[Array, Array]:
+    """2 Xc / (|Xc| + Zc), 2 Yc / (|Xc| + Zc): for fields of view beyond some 100°."""
+    x, y, z = ray
+    sum_ = jnp.sqrt(rot.dot(ray, ray)) + z
+    seen = sum_ > 0
+    safe = jnp.where(seen, sum_, 1.0)
+    opposite = lambda value: jnp.where(seen, 2 * value / safe, jnp.inf)
+    return opposite(x), opposite(y)
+
+
+def corrected(camera: Camera, measured: Measured) -> Pair:
+    """The place about the principal place, free of distortion."""
+    displaced = jnp.sum(measured.field * camera.field[None], axis=1)
+    about = measured.place - camera.principal
+    if camera.brown.size == 0:
+        return about - displaced
+    return about + corrections(about, camera.brown) - displaced
+
+
+def scale(camera: Camera, measured: Measured) -> Pair:
+    """The focal lengths along x and y at a place."""
+    return jnp.sum(measured.focal * camera.focal[None], axis=1)
+
+
+def misfit(rays: Rays, station: Station, camera: Camera, measured: Measured) -> Pair:
+    """The corrected place minus the image of the object point: zero if both fit."""
+    ray = jnp.stack(rays(station.to_camera(measured.point)))
+    return corrected(camera, measured) - scale(camera, measured) * ray

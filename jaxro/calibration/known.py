@@ -1,0 +1,86 @@
+"""What is known of the camera before an image is adjusted."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .camera import Camera
+from .images import Frame
+from .models import Model
+from .problem import FIXED, Observed, Prior
+
+
+class Known(eqx.Module):
+    """What is known of the camera beforehand, in the unit of the image, with standard
+    deviations in the unit of sigma0 times sigma (infinite: unknown)."""
+
+    principal: Float[Array, "2"]
+    principal_sigma: Float[Array, "2"]
+    focal: Float[Array, ""]
+    focal_sigma: Float[Array, ""]
+
+    def free(self, model: Model) -> Float[Array, ""]:
+        """How many numbers of the inner orientation are free: of the principal place,
+        the focal lengths (along x, along y) and the affinity. The image of a plane
+        tells two."""
+        focals = 1.0 if model.y is None else 2.0
+        affine = 2.0 if model.brown is not None and model.brown.affinity else 0.0
+        known = jnp.isfinite(
+            jnp.concatenate([self.principal_sigma, self.focal_sigma[None]])
+        )
+        return affine + jnp.sum(jnp.where(known, 0.0, jnp.array([1.0, 1.0, focals])))
+
+
+NOTHING = Known(jnp.zeros(2), jnp.full(2, jnp.inf), jnp.ones(()), jnp.full((), jnp.inf))
+"""Nothing is known."""
+
+
+def known(
+    *,
+    principal: tuple[float, float] | None = None,
+    principal_sigma: ArrayLike = 0.0,
+    focal: float | None = None,
+    focal_sigma: ArrayLike = 0.0,
+) -> Known:
+    """A principal place and a focal length with standard deviations."""
+    infinite = jnp.full((), jnp.inf)
+    at = jnp.zeros(2) if principal is None else jnp.asarray(principal, float)
+    of = infinite if principal is None else jnp.asarray(principal_sigma, float)
+    return Known(
+        at,
+        jnp.broadcast_to(of, (2,)),
+        jnp.asarray(1.0 if focal is None else focal, float),
+        infinite if focal is None else jnp.asarray(focal_sigma, float),
+    )
+
+
+def prior(
+    model: Model,
+    camera: Camera,
+    known: Known,
+    given: Frame,
+    observed: Observed,
+    basis: Float[Array, "zone parameter"],
+) -> Prior:
+    """What is known beforehand of the parameters of a model."""
+    at = given.normal_places(known.principal)
+    focal = known.focal / given.size
+    value = Camera(
+        principal=at,
+        focal=focal * jnp.sum(basis, axis=0),
+        brown=jnp.zeros_like(camera.brown),
+        field=jnp.zeros_like(camera.field),
+    )
+    least = (FIXED * observed.sigma) ** 2
+    of = lambda sigma: jnp.maximum((sigma / given.size) ** 2, least)
+    none = (False,) * camera.brown.size
+    free = np.array(none if model.brown is None else model.brown.free)
+    strength = 1.0 if model.field is None else model.field.strength
+    variance = Camera(
+        principal=of(known.principal_sigma),
+        focal=jnp.broadcast_to(of(known.focal_sigma), camera.focal.shape),
+        brown=jnp.where(free, jnp.inf, least),
+        field=jnp.full_like(camera.field, 1.0) * (strength * observed.sigma) ** 2,
+    )
+    return Prior(value, variance)

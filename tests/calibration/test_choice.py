@@ -1,0 +1,104 @@
+"""Which model an image needs: the right one is found, and it predicts."""
+
+import numpy as np
+import pytest
+from oracles_calibration import scene
+
+from jaxro import calibration
+from jaxro.calibration import Brown, Field, Model
+
+SIGMA = 0.006
+
+
+def film(rng, places, most=0.9, half=30.0):
+    """Another smooth deformation of the film for every image, unsymmetric: polynomials
+    of the fourth degree."""
+    powers = [(i, j) for i in range(5) for j in range(5) if 0 < i + j <= 4]
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 21)] * 2), -1).reshape(-1, 2)
+    legendre = lambda t, k: np.polynomial.legendre.Legendre.basis(k)(t)
+    coefficients = rng.normal(size=(2, len(powers)))
+    coefficients /= np.array([(i + j) ** 1.5 for i, j in powers])
+
+    def moved(t):
+        basis = [legendre(t[:, 0], i) * legendre(t[:, 1], j) for i, j in powers]
+        return (coefficients @ np.array(basis)).T
+
+    return moved(places / half) * most / np.hypot(*moved(grid).T).max()
+
+
+def images(seed, n, distort):
+    """A measured image, and 100 more points of it without errors: places, points."""
+    rng = np.random.default_rng(seed)
+    _, _, points, places = scene(rng, n + 100)
+    places = places + distort(rng, places) + [100.0, 50.0]
+    noisy = places[:n] + rng.normal(0, SIGMA, (n, 2))
+    image = calibration.image(*noisy.T, points[:n], sigma=SIGMA, y_down=True)
+    return image, places[n:], points[n:]
+
+
+def radial(rng, places):
+    return places * np.sum(places**2, axis=1, keepdims=True) / 1800 * 0.9 / 42.4
+
+
+def nothing(rng, places):
+    return 0 * places
+
+
+def error(found, places, points):
+    """Root mean square of what is wrong in new places."""
+    return float(np.sqrt(np.mean(np.asarray(found.misfits(places, points)) ** 2)))
+
+
+LENS = Model(brown=Brown())
+FEW = (
+    Model(),
+    Model(brown=Brown(1, tangential=False, affinity=False)),
+    LENS,
+    *(
+        Model(brown=lens, field=Field(length, strength))
+        for lens in (None, Brown())
+        for length in (0.8, 1.25)
+        for strength in (10.0, 100.0)
+    ),
+)
+
+
+def test_the_model_that_an_image_needs():
+    expected = {
+        nothing: lambda model: model == FEW[0],
+        radial: lambda model: model == FEW[1],
+        film: lambda model: model.field is not None,
+    }
+    for distort, right in expected.items():
+        image, places, points = images(1, 60, distort)
+        found, compared = calibration.choose(image, FEW)
+        assert right(compared.best)
+        assert np.all(np.isfinite(compared.figures.score))
+        own = error(found.check(), places, points)
+        best = min(
+            error(calibration.calibrate(image, model), places, points)
+            for model in (FEW[0], FEW[1], LENS)
+        )
+        assert own < (best / 3 if distort is film else 1.1 * best)
+        number = int(np.argmin(np.asarray(compared.figures.score)))
+        np.testing.assert_allclose(
+            compared.figures.effective[number], found.effective, rtol=1e-6
+        )
+        np.testing.assert_allclose(
+            compared.figures.sigma0[number], found.sigma0, rtol=1e-8
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [30, 60, 200])
+def test_film_that_is_deformed_by_a_millimetre(n):
+    gains = []
+    for seed in range(10):
+        image, places, points = images(seed, n, film)
+        found, _ = calibration.choose(image)
+        others = (calibration.calibrate(image, model) for model in (Model(), LENS))
+        own = error(found, places, points)
+        gains.append([error(other, places, points) / own for other in others])
+    over_one, over_brown = np.median(gains, axis=0)
+    assert over_one > (4 if n == 30 else 5)
+    assert over_brown > (2 if n == 30 else 2.5)
