@@ -10,6 +10,7 @@ from .choice import (
     compare as compare,
     default_models as default_models,
 )
+from .correct import Corrected as Corrected, correct as correct
 from .field import Field as Field
 from .images import MeasuredImage as MeasuredImage, image as image
 from .known import Known as Known, known as known
