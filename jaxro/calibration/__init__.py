@@ -14,10 +14,15 @@ from .correct import Corrected as Corrected, correct as correct
 from .field import Field as Field
 from .images import MeasuredImage as MeasuredImage, image as image
 from .known import Known as Known, known as known
+from .measured_images import MeasuredImages as MeasuredImages, images as images
 from .models import Model as Model
 from .pieces import Pieces as Pieces, pieces as pieces
 from .result import Calibration as Calibration
 from .results import RESULTS as RESULTS, is_usable as is_usable
+from .together import (
+    Together as Together,
+    calibrate_together as calibrate_together,
+)
 from .zones import (
     AbstractZones as AbstractZones,
     Numbered as Numbered,

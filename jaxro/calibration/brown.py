@@ -22,19 +22,21 @@ POWERS = (2, 4, 6, 1, 1, 0, 0)
 class Brown(eqx.Module):
     """Which of Brown's coefficients are unknowns; the others are zero.
 
-    `radial`: k1, k1 and k2, or all three. `affinity`: b1 and b2, which are part of the
-    focal lengths where these differ along x and y.
+    `radial`: k1, k1 and k2, or all three; `tangential`: p1 and p2. `affinity`: b1, for
+    a scale of x that is not that of y, which is part of the focal lengths where these
+    differ along x and y. `shear`: b2, for axes that are not at right angles.
     """
 
     radial: int = eqx.field(static=True, default=3)
     tangential: bool = eqx.field(static=True, default=True)
     affinity: bool = eqx.field(static=True, default=True)
+    shear: bool = eqx.field(static=True, default=True)
 
     @property
     def free(self) -> tuple[bool, ...]:
         """Which coefficients of `NAMES` are unknowns."""
         radial = tuple(power < self.radial for power in range(3))
-        return (*radial, *(self.tangential,) * 2, *(self.affinity,) * 2)
+        return (*radial, *(self.tangential,) * 2, self.affinity, self.shear)
 
 
 def corrections(place: Float[Array, "2"], k: Float[Array, "7"]) -> Float[Array, "2"]:

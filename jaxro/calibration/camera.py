@@ -32,8 +32,8 @@ class Station(AbstractParameters):
     enters as the vector part of a quaternion (1, w/2), and the three coordinates.
     """
 
-    quaternion: Float[Array, "4"]
-    centre: Vector
+    quaternion: Float[Array, "*image 4"]
+    centre: Float[Array, "*image 3"]
 
     @property
     def count(self) -> int:
@@ -68,10 +68,10 @@ class Camera(eqx.Module):
     """The inner orientation and the distortion of an image, in the units of its
     frame. `brown` has seven coefficients or none."""
 
-    principal: Pair
-    focal: Float[Array, " zone"]
-    brown: Float[Array, " coefficient"]
-    field: Float[Array, " mode"]
+    principal: Float[Array, "*camera 2"]
+    focal: Float[Array, "*camera zone"]
+    brown: Float[Array, "*camera coefficient"]
+    field: Float[Array, "*camera mode"]
 
 
 class Measured(NamedTuple):

@@ -85,8 +85,9 @@ def default_models(rays: Rays = perspective) -> tuple[Model, ...]:
     """One focal length; two; Brown's lens with one, two or three radial coefficients
     and with all; a displacement field of several lengths and strengths, alone and with
     Brown's lens."""
-    lenses = [Brown(k, tangential=False, affinity=False) for k in (1, 2, 3)]
-    lenses += [Brown(2, affinity=False), Brown(3, affinity=False), Brown()]
+    square = {"affinity": False, "shear": False}
+    lenses = [Brown(k, tangential=False, **square) for k in (1, 2, 3)]
+    lenses += [Brown(2, **square), Brown(3, **square), Brown(shear=False), Brown()]
     plain = [Model(), Model(y=Whole()), *(Model(brown=lens) for lens in lenses)]
     fields = [
         Model(brown=lens, field=Field(length, strength))

@@ -22,10 +22,11 @@ class Known(eqx.Module):
 
     def free(self, model: Model) -> Float[Array, ""]:
         """How many numbers of the inner orientation are free: of the principal place,
-        the focal lengths (along x, along y) and the affinity. The image of a plane
+        the focal lengths (along x, along y), affinity and shear. The image of a plane
         tells two."""
         focals = 1.0 if model.y is None else 2.0
-        affine = 2.0 if model.brown is not None and model.brown.affinity else 0.0
+        lens = model.brown
+        affine = 0.0 if lens is None else float(lens.affinity + lens.shear)
         known = jnp.isfinite(
             jnp.concatenate([self.principal_sigma, self.focal_sigma[None]])
         )

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment import symmetric
+from ..adjustment.guarded import root
 from ..geometry import rotations as rot
 from ..xla.passes import count
 from .camera import Station
@@ -25,6 +26,9 @@ Matrix = Float[Array, "3 3"]
 
 LADDER = (1.2, 2.0, 3.2, 5.0, 8.0)
 """Focal lengths in half widths of the measured area, for plane objects."""
+
+NEARLY_FLAT = 0.02
+"""Thickness over extent below which an object is nearly a plane."""
 
 SQUARINGS = 6
 """How often the inverse of a matrix is squared until it is that of its smallest
@@ -77,25 +81,56 @@ def _of_any(u: Places, points: Points, mask: Mask, sign) -> Start:
 
 def _of_plane(u: Places, points: Points, mask: Mask, sign) -> Start:
     """By the homography, for several focal lengths."""
+    plane = homography(u, points, mask)
+    told, square = right_angled(plane.h)
+    focal = focal_of(told, square)
+    ladder = jnp.concatenate([focal[None], jnp.array(LADDER)])
+    station = jax.vmap(plane.station)(ladder)
+    zero = jnp.zeros((len(ladder), 2))
+    return Start(station, ladder, zero, jnp.broadcast_to(sign, ladder.shape))
+
+
+def thickness(points: Points, mask: Mask) -> Float[Array, ""]:
+    """The root mean square distance of points from the plane nearest to them, over that
+    from their centroid."""
     use = mask[:, None]
-    middle = jnp.sum(points, axis=0) / jnp.maximum(count(mask), 1.0)
+    number = jnp.maximum(count(mask), 1.0)
+    middle = jnp.sum(jnp.where(use, points, 0.0), axis=0) / number
+    apart = jnp.where(use, points - middle[None], 0.0)
+    moments = apart.T @ apart
+    across = jnp.sum((apart @ plane_axes(moments)[2]) ** 2)
+    extent = jnp.trace(moments)
+    return root(across / jnp.where(extent > 0, extent, 1.0))
+
+
+class Homography(eqx.Module):
+    """The images of points in the plane nearest to them: u ~ H (ξ, η, 1) with ξ, η along
+    the first two `axes` from `middle`."""
+
+    h: Matrix
+    axes: Matrix
+    middle: Vector
+
+    def station(self, focal: Float[Array, ""]) -> Station:
+        """The station with this focal length, the principal place at zero."""
+        k = self.h / jnp.stack([focal, focal, jnp.ones_like(focal)])[:, None]
+        lengths = jnp.sqrt(jnp.maximum(jnp.sum(k[:, :2] ** 2, axis=0), 1e-100))
+        first, second = (k[:, :2] / lengths[None]).T
+        of_object = _rotation(first, second).T @ self.axes
+        shift = k[:, 2] / jnp.sqrt(lengths[0] * lengths[1])
+        return Station(_quaternion(of_object), self.middle - of_object.T @ shift)
+
+
+def homography(u: Places, points: Points, mask: Mask) -> Homography:
+    """The `Homography` of the points in use."""
+    use = mask[:, None]
+    number = jnp.maximum(count(mask), 1.0)
+    middle = jnp.sum(jnp.where(use, points, 0.0), axis=0) / number
     apart = jnp.where(use, points - middle[None], 0.0)
     axes = plane_axes(apart.T @ apart)
     inside = apart @ axes.T
     m, last = _projection(u, inside[:, :2], mask)
-    h = jnp.concatenate([m, last[:, None]], axis=1)
-
-    def of_focal(focal: Float[Array, ""]) -> Start:
-        k = h / jnp.stack([focal, focal, jnp.ones_like(focal)])[:, None]
-        lengths = jnp.sqrt(jnp.maximum(jnp.sum(k[:, :2] ** 2, axis=0), 1e-100))
-        first, second = (k[:, :2] / lengths[None]).T
-        of_object = _rotation(first, second).T @ axes
-        shift = k[:, 2] / jnp.sqrt(lengths[0] * lengths[1])
-        station = Station(_quaternion(of_object), middle - of_object.T @ shift)
-        return Start(station, focal, jnp.zeros(2), sign)
-
-    ladder = jnp.concatenate([_right_angled(h)[None], jnp.array(LADDER)])
-    return jax.vmap(of_focal)(ladder)
+    return Homography(jnp.concatenate([m, last[:, None]], axis=1), axes, middle)
 
 
 def plane_axes(moments: Matrix) -> Matrix:
@@ -135,16 +170,23 @@ def least_vector(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
     return column / jnp.sqrt(jnp.sum(column**2))
 
 
-def _right_angled(h: Matrix) -> Float[Array, ""]:
-    """The focal length for which the images of two axes are those of a square grid."""
+def right_angled(h: Matrix) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Of 1/f², for which the images of two axes are those of a square grid: two
+    conditions a/f² + b = 0, as -Σ a b and Σ a². Several images of a camera add theirs."""
+    # in units in which the two columns count alike in every image
+    h = h / jnp.sqrt(jnp.maximum(jnp.sum(h[:, :2] ** 2), 1e-100))
     a, b = h[:, 0], h[:, 1]
     across = a[0] * b[0] + a[1] * b[1]
     longer = a[0] ** 2 + a[1] ** 2 - b[0] ** 2 - b[1] ** 2
     depth_across, depth_longer = a[2] * b[2], a[2] ** 2 - b[2] ** 2
-    squares = across**2 + longer**2
-    weight = -(across * depth_across + longer * depth_longer) / jnp.where(
-        squares > 0, squares, 1.0
-    )
+    product = across * depth_across + longer * depth_longer
+    return -product, across**2 + longer**2
+
+
+def focal_of(product: Float[Array, ""], square: Float[Array, ""]) -> Float[Array, ""]:
+    """The focal length of `right_angled`; of a moderate tele lens where it is not
+    told."""
+    weight = product / jnp.where(square > 0, square, 1.0)
     told = (weight > 1e-4) & (weight < 25.0)
     return jnp.where(told, 1 / jnp.sqrt(jnp.where(told, weight, 1.0)), 2.8)
 

@@ -5,17 +5,13 @@ from jaxtyping import Array, Float
 
 from .. import adjustment
 from ..adjustment import JointAdjustment
-from ..xla.passes import count
 from .images import MeasuredImage
 from .models import Model
 from .results import RESULTS, of_adjustment
-from .starts import plane_axes
+from .starts import NEARLY_FLAT, thickness
 
 FLAT = 1e-6
 """Thickness of an object over its extent below which it is a plane."""
-
-NEARLY_FLAT = 0.02
-"""The same below which a weakly determined station is the fault of the object."""
 
 OF_A_PLANE = 2
 """Numbers of the inner orientation that the image of a plane tells: a homography has
@@ -37,12 +33,12 @@ def verdict(
     orientation are."""
     number = 2 * jnp.sum(measured.mask)
     spare = number - model.unknowns
-    thickness = object_thickness(measured)
+    thick = thickness(measured.points, measured.mask)
     station = found.parameters["station"]
     deviations = jnp.sqrt(jnp.diagonal(found.covariance("station")[0])[3:])
     distance = jnp.sqrt(jnp.sum(station.centre[0] ** 2))
     weak = ~(jnp.max(deviations) <= WEAK * distance)
-    plane = (thickness < FLAT) | ((thickness < NEARLY_FLAT) & weak)
+    plane = (thick < FLAT) | ((thick < NEARLY_FLAT) & weak)
     flat = plane & (free > OF_A_PLANE)
     settled = found.result == adjustment.RESULTS.successful
     seen = jnp.any(focal != 0, axis=1) & measured.mask[:, None]
@@ -60,17 +56,3 @@ def verdict(
     for name, holds in reversed(table):
         result = RESULTS.where(holds, name, result)  # pyright: ignore[reportArgumentType]
     return result  # pyright: ignore[reportReturnType]
-
-
-def object_thickness(measured: MeasuredImage) -> Float[Array, ""]:
-    """The root mean square distance of the object points from the plane nearest to
-    them, over that from their centroid."""
-    use = measured.mask[:, None]
-    number = jnp.maximum(count(measured.mask), 1.0)
-    middle = jnp.sum(measured.points, axis=0) / number
-    apart = jnp.where(use, measured.points - middle[None], 0.0)
-    moments = apart.T @ apart
-    normal = plane_axes(moments)[2]
-    across = jnp.sum((apart @ normal) ** 2)
-    extent = jnp.trace(moments)
-    return jnp.sqrt(across / jnp.where(extent > 0, extent, 1.0))

@@ -52,7 +52,7 @@ def error(found, places, points):
 LENS = Model(brown=Brown())
 FEW = (
     Model(),
-    Model(brown=Brown(1, tangential=False, affinity=False)),
+    Model(brown=Brown(1, tangential=False, affinity=False, shear=False)),
     LENS,
     *(
         Model(brown=lens, field=Field(length, strength))

@@ -1,0 +1,251 @@
+"""The calibration of several images at once: stations, cameras that they share or not,
+and the object points, which are eliminated.
+
+The points that are known hold the datum, with their standard deviations; all others are
+unknowns. With a camera in common, points in a plane are enough, if the images are tilted
+in different directions.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from ..adjustment import RESULTS, JointAdjustment, LevenbergMarquardt, Term, adjust
+from ..xla.passes import count
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
+from .camera import Camera, Measured, Station, misfit
+from .first_stations import first_stations
+from .images import Frame
+from .measured_images import MeasuredImages
+from .models import Model, field_weights, focal_weights
+from .problem import FIXED, MAX_STEPS, flat
+from .zones import Area
+
+
+class Together(eqx.Module):
+    """Several images, adjusted together. Properties are in the units of the images and
+    of the object, standard deviations a posteriori."""
+
+    measured: MeasuredImages
+    model: Model
+    frame: Frame
+    area: Area
+    adjustment: JointAdjustment
+
+    @property
+    def usable(self) -> Bool[Array, ""]:
+        """Whether the adjustment came to rest and determines all unknowns."""
+        return self.adjustment.result == RESULTS.successful  # pyright: ignore[reportReturnType]
+
+    @property
+    def sigma0(self) -> Float[Array, ""]:
+        """The standard deviation of a coordinate with sigma 1."""
+        return self.adjustment.sigma0
+
+    @property
+    def centres(self) -> Float[Array, "image 3"]:
+        """The projection centres."""
+        return self.frame.object_points(self.adjustment.parameters["station"].centre)
+
+    @property
+    def centre_deviations(self) -> Float[Array, "image 3"]:
+        """Standard deviations of the projection centres."""
+        return self._deviations("station")[:, 3:] * self.frame.length
+
+    @property
+    def points(self) -> Float[Array, "point 3"]:
+        """The object points."""
+        return self.frame.object_points(self.adjustment.parameters["point"])
+
+    @property
+    def point_deviations(self) -> Float[Array, "point 3"]:
+        """Standard deviations of the object points."""
+        return self._deviations("point") * self.frame.length
+
+    @property
+    def cameras(self) -> Camera:
+        """The cameras, in the units of the frame."""
+        return self.adjustment.parameters["camera"]
+
+    @property
+    def focal(self) -> Float[Array, "camera zone"]:
+        """The focal lengths of each camera."""
+        return self.cameras.focal * self.frame.size
+
+    @property
+    def focal_deviations(self) -> Float[Array, "camera zone"]:
+        """Standard deviations of the focal lengths."""
+        number = self.cameras.focal.shape[1]
+        return self._deviations("camera")[:, 2 : 2 + number] * self.frame.size
+
+    @property
+    def principal(self) -> Float[Array, "camera 2"]:
+        """The principal place of each camera."""
+        return self.frame.measured_places(self.cameras.principal)
+
+    def _deviations(self, family: str) -> Float[Array, "member d"]:
+        covariance = self.adjustment.covariance(family)
+        variances = jnp.diagonal(covariance, axis1=1, axis2=2)
+        return jnp.sqrt(jnp.maximum(variances, 0.0))
+
+    def residuals(
+        self,
+        places: Float[ArrayLike, "place 2"],
+        image: Int[ArrayLike, " place"],
+        point: Int[ArrayLike, " place"],
+    ) -> Float[Array, "place 2"]:
+        """What would have to be added to places of these images, measured or new, so
+        that they fit, in the unit of the image."""
+        u = self.frame.normal_places(jnp.asarray(places))
+        image, point = jnp.asarray(image), jnp.asarray(point)
+        stations = jax.tree.map(
+            lambda a: a[image], self.adjustment.parameters["station"]
+        )
+        number = self.measured.camera[image]
+        cameras = jax.tree.map(lambda a: a[number], self.cameras)
+        measured = Measured(
+            u,
+            self.adjustment.parameters["point"][point],
+            focal_weights(self.model, u, self.area),
+            field_weights(self.model, u, self.area),
+        )
+        correction = jax.vmap(partial(_correction, self.model.rays))
+        found = correction(stations, cameras, measured)
+        return found * self.frame.axes[None] * self.frame.size
+
+
+def calibrate_together(
+    measured: MeasuredImages, model: Model | None = None
+) -> Together:
+    """Adjust several images together; unknown points are eliminated.
+
+    A field, focal lengths and the lens are those of each camera. Zones of focal lengths
+    that change linearly are for single images.
+    """
+    model = Model() if model is None else model
+    if model.imitated:
+        raise ValueError(
+            "calibrate_together: focal lengths that change linearly imitate tilts; take "
+            "a field, or zones of degree 0"
+        )
+    return Program(_adjust, {"model": model}, COMPILE_FAST)(measured)
+
+
+def _adjust(measured: MeasuredImages, model: Model) -> Together:
+    given = _frame(measured)
+    u = given.normal_places(measured.places)
+    begin = first_stations(measured, given, u)
+    use = jnp.ones(len(u), bool)
+    area = Area(u, use, given.half_sides, jnp.zeros(2))
+    cameras = measured.cameras
+    focal, field = focal_weights(model, u, area), field_weights(model, u, area)
+    sigma = measured.sigma / given.size
+    size = 0 if model.brown is None else 7
+    camera = Camera(
+        principal=jnp.tile(jnp.median(begin.inner.principal, axis=0), (cameras, 1)),
+        focal=jnp.full((cameras, focal.shape[2]), jnp.median(begin.inner.focal)),
+        brown=jnp.zeros((cameras, size)),
+        field=jnp.zeros((cameras, field.shape[2])),
+    )
+    condition = lambda station, camera, point, seen: misfit(
+        model.rays, station, camera, Measured(seen[0], point, seen[1], seen[2])
+    )
+    of_places = Term(
+        condition,
+        (u, focal, field),
+        (sigma**2, None, None),
+        touches=[
+            ("station", measured.image),
+            ("camera", measured.camera[measured.image]),
+            ("point", measured.point),
+        ],
+    )
+    families = {"station": begin.stations, "camera": camera, "point": begin.points}
+    terms = [of_places, _known_points(measured, given), *_prior(model, camera, sigma)]
+    found = adjust(
+        terms,
+        families,
+        eliminate="point",
+        solver=LevenbergMarquardt(),
+        max_steps=MAX_STEPS,
+    )
+    return Together(measured, model, given, area, found)
+
+
+def _known_points(measured: MeasuredImages, given: Frame) -> Term:
+    """The object points as observations of what is known of them."""
+    least = FIXED * jnp.min(measured.sigma) / given.size
+    deviation = jnp.maximum(measured.point_sigma / given.length, least)
+    known = jnp.all(jnp.isfinite(deviation), axis=1)
+    variance = jnp.where(known[:, None], deviation, 1.0) ** 2
+    return Term(
+        lambda point, at: point - at,
+        given.normal_points(measured.points),
+        variance,
+        touches=[("point", jnp.arange(len(measured.points)))],
+        mask=known,
+    )
+
+
+def _prior(model: Model, camera: Camera, sigma: Float[Array, " place"]) -> list[Term]:
+    """The coefficients of the field, and those of the lens that are not unknowns, as
+    observations of zero."""
+    mean = jnp.sqrt(jnp.mean(sigma**2))
+    one = jax.tree.map(lambda a: a[0], camera)
+    none = (False,) * one.brown.size
+    free = np.array(none if model.brown is None else model.brown.free)
+    strength = 1.0 if model.field is None else model.field.strength
+    infinite = lambda a: jnp.full_like(a, jnp.inf)
+    variance = flat(
+        Camera(
+            principal=infinite(one.principal),
+            focal=infinite(one.focal),
+            brown=jnp.where(free, jnp.inf, (FIXED * mean) ** 2),
+            field=jnp.full_like(one.field, 1.0) * (strength * mean) ** 2,
+        )
+    )
+    known = jnp.isfinite(variance)
+    cameras, size = camera.principal.shape[0], variance.size
+    tile = lambda a: jnp.tile(a, cameras)
+    return [
+        Term(
+            lambda camera, row: flat(camera)[row[0]] - row[1],
+            (tile(jnp.arange(size)), jnp.zeros(cameras * size)),
+            (None, tile(jnp.where(known, variance, 1.0))),
+            touches=[("camera", jnp.repeat(jnp.arange(cameras), size))],
+            mask=tile(known),
+        )
+    ]
+
+
+def _frame(measured: MeasuredImages) -> Frame:
+    """The frame of all places, and of the known points."""
+    known = jnp.all(jnp.isfinite(measured.point_sigma), axis=1)
+    use = known[:, None]
+    number = jnp.maximum(count(known), 1.0)
+    middle = jnp.sum(jnp.where(use, measured.points, 0.0), axis=0) / number
+    apart = jnp.where(use, measured.points - middle[None], 0.0)
+    least, most = jnp.min(measured.places, axis=0), jnp.max(measured.places, axis=0)
+    return Frame(
+        centre=(least + most) / 2,
+        size=jnp.max(most - least) / 2,
+        half_sides=(most - least) / jnp.max(most - least),
+        middle=middle,
+        length=jnp.sqrt(jnp.sum(apart**2) / number),
+        handedness=measured.handedness,
+    )
+
+
+def _correction(rays, station: Station, camera: Camera, measured: Measured) -> Array:
+    """The smallest correction of one place with which it fits, -B⁻¹ g."""
+    at = lambda place: misfit(rays, station, camera, measured._replace(place=place))
+    g, b = at(measured.place), jax.jacfwd(at)(measured.place)
+    volume = b[0, 0] * b[1, 1] - b[0, 1] * b[1, 0]
+    x = b[1, 1] * g[0] - b[0, 1] * g[1]
+    y = b[0, 0] * g[1] - b[1, 0] * g[0]
+    return -jnp.stack([x, y]) / volume
