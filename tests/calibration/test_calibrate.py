@@ -341,7 +341,7 @@ def test_intervals_hold_the_truth(model, n):
     *found, usable = jax.jit(jax.vmap(errors))(stacked)
     assert np.mean(usable) > 0.99
     for (value, half), true in zip(found, (np.array(stations), 60.0, AT), strict=True):
-        held = np.abs(value - true) <= half
+        held = np.abs(np.asarray(value) - true) <= np.asarray(half)
         shares = held[np.asarray(usable)].mean(axis=0)
         # 93.5 to 96.5 % on the average; each with the error of 1,000 runs
         assert 0.935 < shares.mean() < 0.965
