@@ -339,7 +339,7 @@ def test_intervals_hold_the_truth(model, n):
 
     stacked = jax.tree.map(lambda *a: jnp.stack(a), *images)
     *found, usable = jax.jit(jax.vmap(errors))(stacked)
-    assert np.mean(usable) > 0.99
+    assert np.mean(usable) > 0.98  # a rectangle may have no point
     for (value, half), true in zip(found, (np.array(stations), 60.0, AT), strict=True):
         held = np.abs(np.asarray(value) - true) <= np.asarray(half)
         shares = held[np.asarray(usable)].mean(axis=0)
