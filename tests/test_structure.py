@@ -3,6 +3,8 @@ it, public names stand once."""
 
 import ast
 import re
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -117,3 +119,15 @@ def test_files_are_small():
         if (count := len(file.read_text(encoding="utf-8").splitlines())) > 460
     }
     assert not long
+
+
+def test_importing_starts_nothing():
+    """No array is made on import, which would start JAX before the user has chosen a
+    device, and nothing is imported that only few calls need."""
+    script = (
+        "import sys, jaxro; from jax._src import xla_bridge; "
+        "print(list(xla_bridge._backends), 'scipy.spatial' in sys.modules)"
+    )
+    line = [sys.executable, "-c", script]
+    done = subprocess.run(line, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.split() == ["[]", "False"]

@@ -10,7 +10,7 @@ from ..xla.settings import MOMENT, settings_for
 from .camera import Camera, Rays
 from .images import Frame, MeasuredImage, frame
 from .known import NOTHING, Known, prior
-from .models import Model, field_weights, focal_weights, imitating
+from .models import Model, field_weights, imitating, parameter_weights
 from .problem import Observed, solve
 from .result import Calibration
 from .starts import Start, candidates
@@ -54,9 +54,7 @@ def _fit(data: tuple[MeasuredImage, Known, Start], model: Model) -> Calibration:
     observed = observe(measured, given)
     area = Area(observed.places, measured.mask, given.half_sides, first.principal)
     basis = imitating(model, area)
-    focal = jnp.einsum(
-        "pcz,zk->pck", focal_weights(model, observed.places, area), basis
-    )
+    focal = parameter_weights(model, observed.places, area, basis)
     field = field_weights(model, observed.places, area)
     camera = Camera(
         principal=first.principal,
@@ -64,7 +62,7 @@ def _fit(data: tuple[MeasuredImage, Known, Start], model: Model) -> Calibration:
         brown=jnp.zeros(0 if model.brown is None else 7),
         field=jnp.zeros(field.shape[2]),
     )
-    beforehand = prior(model, camera, known, given, observed, basis)
+    beforehand = prior(model, camera, known, given, observed.sigma, basis)
     start = first.station, camera
     found = solve(observed, focal, field, beforehand, model.rays, start)
     return Calibration(
@@ -77,7 +75,7 @@ def _fit(data: tuple[MeasuredImage, Known, Start], model: Model) -> Calibration:
         focal_weights=focal,
         field_weights=field,
         adjustment=found,
-        result=verdict(measured, model, known.free(model), focal, found),
+        result=verdict(measured, known.free(model), focal, found),
     )
 
 
@@ -109,7 +107,7 @@ def first_fit(measured: MeasuredImage, known: Known, rays: Rays) -> Start:
         given = frame(measured, start.handedness)
         observed = observe(measured, given)
         camera = Camera(start.principal, start.focal[None], jnp.zeros(0), jnp.zeros(0))
-        beforehand = prior(one, camera, known, given, observed, basis)
+        beforehand = prior(one, camera, known, given, observed.sigma, basis)
         start_of = start.station, camera
         found = solve(observed, focal, nothing, beforehand, rays, start_of, FIRST_STEPS)
         squares = sum(jnp.sum(r**2) for r in found.residuals)

@@ -30,7 +30,7 @@ from .camera import Camera, Rays, perspective
 from .field import MODES, Field
 from .images import MeasuredImage, frame
 from .known import NOTHING, Known, prior
-from .models import Model, field_weights, focal_weights, imitating
+from .models import Model, field_weights, imitating, parameter_weights
 from .problem import FIXED, Observed, Prior, solve
 from .result import Calibration
 from .starts import Start
@@ -137,8 +137,7 @@ def _compare(
 
     def pad(model: Model) -> _Padded:
         basis = imitating(model, area)
-        weights = focal_weights(model, observed.places, area)
-        focal = jnp.einsum("pcz,zk->pck", weights, basis)
+        focal = parameter_weights(model, observed.places, area, basis)
         missing = most - focal.shape[2]
         none = model.field is None
         key = None if model.field is None else (model.field.length, model.brown)
@@ -154,7 +153,7 @@ def _compare(
             brown=jnp.zeros(7),
             field=jnp.zeros(2 * MODES),
         )
-        beforehand = prior(model, camera, known, given, observed, basis)
+        beforehand = prior(model, camera, known, given, observed.sigma, basis)
         fixed = (FIXED * observed.sigma) ** 2
         longer = lambda a, value: jnp.pad(a, (0, missing), constant_values=value)
         at_focal = lambda c: c.focal

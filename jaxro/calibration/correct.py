@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
-from scipy.spatial import Delaunay, QhullError
 
 from ..adjustment.guarded import root
-from .camera import Camera, Measured, corrected, scale
-from .models import field_weights, focal_weights
+from .camera import Measured, corrected, scale
+from .models import field_weights, parameter_weights
 from .result import Calibration
 
 
@@ -40,16 +39,14 @@ def correct(found: Calibration, places: Float[ArrayLike, "n 2"]) -> Corrected:
     """
     places = jnp.asarray(places, float)
     u = found.frame.normal_places(places)
-    weights = jnp.einsum(
-        "pcz,zk->pck", focal_weights(found.model, u, found.area), found.basis
-    )
+    weights = parameter_weights(found.model, u, found.area, found.basis)
     field = field_weights(found.model, u, found.area)
     focal = jnp.mean(found.basis @ found.camera.focal)
     measured = Measured(u, jnp.zeros((len(u), 3)), weights, field)
     ideal = lambda camera, one: focal * corrected(camera, one) / scale(camera, one)
     at = jax.vmap(partial(ideal, found.camera))(measured)
     slopes = jax.vmap(partial(jax.jacfwd(ideal), found.camera))(measured)
-    j = jnp.concatenate([_columns(slopes, name) for name in Camera.__annotations__], 2)
+    j = jnp.concatenate(jax.tree.leaves(slopes), axis=2)
     own = found.covariance[6:, 6:]
     variances = jnp.einsum("nci,ij,ncj->nc", j, own, j)
     mean = jnp.sqrt(jnp.mean(found.measured.sigma**2, where=found.measured.mask))
@@ -63,12 +60,10 @@ def correct(found: Calibration, places: Float[ArrayLike, "n 2"]) -> Corrected:
     )
 
 
-def _columns(slopes: Camera, name: str) -> Float[Array, "n 2 k"]:
-    return getattr(slopes, name)
-
-
 def _among(found: Calibration, places: np.ndarray) -> Bool[np.ndarray, " n"]:
     """Whether places lie in the convex hull of those that calibrated the image."""
+    from scipy.spatial import Delaunay, QhullError  # slow to import
+
     mask = np.asarray(found.measured.mask)
     try:
         hull = Delaunay(np.asarray(found.measured.places)[mask])

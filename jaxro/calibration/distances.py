@@ -5,8 +5,10 @@ of the measuring system (Yurchenko 2002, equation (1)).
 
 From n points there are n(n-1)/2 distances, of 2n coordinates: only 2n - 3 of them are
 independent. With their full cofactor matrix they give what the coordinates give
-(`calibrate`), with more work. As if they were independent, they give nearly the same
-station, but standard deviations that are too small by about √n / 2.
+(`calibrate`), with more work, where one focal length serves both axes. Else they know
+less: nothing tells them the direction of the measuring axes, which is one unknown more.
+As if they were independent, they give nearly the same station, but standard deviations
+that are too small by about √n / 2.
 """
 
 import equinox as eqx
@@ -25,6 +27,7 @@ from .problem import Observed
 from .result import Calibration
 
 ROUNDS = 100
+"""Steps of Levenberg-Marquardt."""
 
 
 class DistanceAdjustment(eqx.Module):
@@ -68,12 +71,14 @@ def adjust_distances(
     """The adjustment of all distances between the points of one image.
 
     With their full cofactor matrix, or as if they were `independent`, as the paper has
-    it, which makes the standard deviations far too small. For models of focal lengths
-    alone, and points that are all in use.
+    it, which makes the standard deviations far too small. Object points are without
+    error. Raises ValueError for models of more than focal lengths, and masked points.
     """
     model = Model() if model is None else model
     if model.brown is not None or model.field is not None:
         raise ValueError("adjust_distances: a model has focal lengths alone")
+    if not np.all(measured.mask):
+        raise ValueError("adjust_distances: leave out the points that are masked")
     start = calibrate(measured, model)
     observed, weights = start.observed, start.focal_weights
     swing = model.y is not None

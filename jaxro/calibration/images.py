@@ -115,16 +115,25 @@ class Frame(eqx.Module):
 
 
 def frame(measured: MeasuredImage, handedness: Float[Array, ""]) -> Frame:
-    """The frame of an image of this handedness, whose measured area is the smallest
-    rectangle along x and y around its points."""
-    use = measured.mask[:, None]
-    number = jnp.maximum(count(measured.mask), 1.0)
-    least = jnp.min(jnp.where(use, measured.places, jnp.inf), axis=0)
-    most = jnp.max(jnp.where(use, measured.places, -jnp.inf), axis=0)
+    """The frame of an image of this handedness."""
+    mask = measured.mask
+    return frame_of(measured.places, mask, measured.points, mask, handedness)
+
+
+def frame_of(
+    places: Float[Array, "place 2"],
+    measured: Bool[Array, " place"],
+    points: Points,
+    known: Bool[Array, " point"],
+    handedness: Float[Array, ""],
+) -> Frame:
+    """The frame of the places that are measured and the points that are known. The
+    measured area is the smallest rectangle along x and y around the places."""
+    least = jnp.min(jnp.where(measured[:, None], places, jnp.inf), axis=0)
+    most = jnp.max(jnp.where(measured[:, None], places, -jnp.inf), axis=0)
     sides = jnp.where(most > least, most - least, 1.0)
-    middle = jnp.sum(measured.points, axis=0) / number
-    apart = jnp.where(use, measured.points - middle[None], 0.0)
-    length = jnp.sqrt(jnp.sum(apart**2) / number)
+    middle, apart = about_centroid(points, known)
+    length = jnp.sqrt(jnp.sum(apart**2) / jnp.maximum(count(known), 1.0))
     return Frame(
         centre=jnp.where(most > least, (least + most) / 2, 0.0),
         size=jnp.max(sides) / 2,
@@ -133,6 +142,15 @@ def frame(measured: MeasuredImage, handedness: Float[Array, ""]) -> Frame:
         length=jnp.where(length > 0, length, 1.0),
         handedness=handedness,
     )
+
+
+def about_centroid(
+    points: Points, use: Bool[Array, " point"]
+) -> tuple[Float[Array, "3"], Points]:
+    """The centroid of the points in use, and these minus it; zero for the others."""
+    number = jnp.maximum(count(use), 1.0)
+    middle = jnp.sum(jnp.where(use[:, None], points, 0.0), axis=0) / number
+    return middle, jnp.where(use[:, None], points - middle[None], 0.0)
 
 
 def _like(array: Array, *vectors: Array) -> tuple[Array, ...]:

@@ -8,17 +8,17 @@ from jaxtyping import Array, ArrayLike, Float
 from .camera import Camera
 from .images import Frame
 from .models import Model
-from .problem import FIXED, Observed, Prior
+from .problem import FIXED, Prior
 
 
 class Known(eqx.Module):
     """What is known of the camera beforehand, in the unit of the image, with standard
     deviations in the unit of sigma0 times sigma (infinite: unknown)."""
 
-    principal: Float[Array, "2"]
-    principal_sigma: Float[Array, "2"]
-    focal: Float[Array, ""]
-    focal_sigma: Float[Array, ""]
+    principal: Float[Array | np.ndarray, "2"]
+    principal_sigma: Float[Array | np.ndarray, "2"]
+    focal: Float[Array | np.ndarray, ""]
+    focal_sigma: Float[Array | np.ndarray, ""]
 
     def free(self, model: Model) -> Float[Array, ""]:
         """How many numbers of the inner orientation are free: of the principal place,
@@ -27,14 +27,14 @@ class Known(eqx.Module):
         focals = 1.0 if model.y is None else 2.0
         lens = model.brown
         affine = 0.0 if lens is None else float(lens.affinity + lens.shear)
-        known = jnp.isfinite(
-            jnp.concatenate([self.principal_sigma, self.focal_sigma[None]])
-        )
+        sigmas = jnp.append(jnp.asarray(self.principal_sigma), self.focal_sigma)
+        known = jnp.isfinite(sigmas)
         return affine + jnp.sum(jnp.where(known, 0.0, jnp.array([1.0, 1.0, focals])))
 
 
-NOTHING = Known(jnp.zeros(2), jnp.full(2, jnp.inf), jnp.ones(()), jnp.full((), jnp.inf))
-"""Nothing is known."""
+NOTHING = Known(np.zeros(2), np.full(2, np.inf), np.ones(()), np.full((), np.inf))
+"""Nothing is known. Arrays of NumPy: those of JAX would start it when this is
+imported."""
 
 
 def known(
@@ -61,20 +61,21 @@ def prior(
     camera: Camera,
     known: Known,
     given: Frame,
-    observed: Observed,
+    sigma: Float[Array, ""],
     basis: Float[Array, "zone parameter"],
 ) -> Prior:
-    """What is known beforehand of the parameters of a model."""
-    at = given.normal_places(known.principal)
-    focal = known.focal / given.size
+    """What is known beforehand of the parameters of a model; `sigma`: the standard
+    deviation of a place in the units of the frame."""
+    at = given.normal_places(jnp.asarray(known.principal))
+    focal = jnp.asarray(known.focal) / given.size
     value = Camera(
         principal=at,
         focal=focal * jnp.sum(basis, axis=0),
         brown=jnp.zeros_like(camera.brown),
         field=jnp.zeros_like(camera.field),
     )
-    least = (FIXED * observed.sigma) ** 2
-    of = lambda sigma: jnp.maximum((sigma / given.size) ** 2, least)
+    least = (FIXED * sigma) ** 2
+    of = lambda deviation: jnp.maximum((deviation / given.size) ** 2, least)
     none = (False,) * camera.brown.size
     free = np.array(none if model.brown is None else model.brown.free)
     strength = 1.0 if model.field is None else model.field.strength
@@ -82,6 +83,6 @@ def prior(
         principal=of(known.principal_sigma),
         focal=jnp.broadcast_to(of(known.focal_sigma), camera.focal.shape),
         brown=jnp.where(free, jnp.inf, least),
-        field=jnp.full_like(camera.field, 1.0) * (strength * observed.sigma) ** 2,
+        field=jnp.full_like(camera.field, 1.0) * (strength * sigma) ** 2,
     )
     return Prior(value, variance)

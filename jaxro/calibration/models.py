@@ -48,19 +48,6 @@ class Model(eqx.Module):
         return sum(a and b for a, b in both)
 
 
-class Weights(eqx.Module):
-    """A model at some places: the weights of the parameters of `camera.Camera` for x
-    and y."""
-
-    focal: Float[Array, "point 2 zone"]
-    field: Float[Array, "point 2 mode"]
-
-
-def weights(model: Model, u: Places, area: Area) -> Weights:
-    """The weights of a model at any places of the frame."""
-    return Weights(focal_weights(model, u, area), field_weights(model, u, area))
-
-
 def focal_weights(model: Model, u: Places, area: Area) -> Float[Array, "point 2 zone"]:
     """The weights of the focal lengths for x and y."""
     of_x = model.x.weights(u, area)
@@ -70,6 +57,13 @@ def focal_weights(model: Model, u: Places, area: Area) -> Float[Array, "point 2 
     along_x = jnp.concatenate([of_x, jnp.zeros_like(of_y)], axis=1)
     along_y = jnp.concatenate([jnp.zeros_like(of_x), of_y], axis=1)
     return jnp.stack([along_x, along_y], axis=1)
+
+
+def parameter_weights(
+    model: Model, u: Places, area: Area, basis: Float[Array, "zone parameter"]
+) -> Float[Array, "point 2 parameter"]:
+    """The weights of the parameters of which `basis` makes the focal lengths."""
+    return jnp.einsum("pcz,zk->pck", focal_weights(model, u, area), basis)
 
 
 def field_weights(model: Model, u: Places, area: Area) -> Float[Array, "point 2 mode"]:

@@ -64,16 +64,17 @@ def measured_term(
     )
 
 
-def prior_term(prior: Prior) -> Term:
-    """The parameters of the camera as observations of what is known of them."""
+def prior_term(prior: Prior, cameras: int = 1) -> Term:
+    """The parameters of each camera as observations of what is known of all of them."""
     value, variance = flat(prior.value), flat(prior.variance)
     known = jnp.isfinite(variance)
+    of_each = lambda a: jnp.tile(a, cameras)
     return Term(
         lambda camera, row: flat(camera)[row[0]] - row[1],
-        (jnp.arange(value.size), value),
-        (None, jnp.where(known, variance, 1.0)),
-        touches=[("camera", jnp.zeros((), int))],
-        mask=known,
+        (of_each(jnp.arange(value.size)), of_each(value)),
+        (None, of_each(jnp.where(known, variance, 1.0))),
+        touches=[("camera", jnp.repeat(jnp.arange(cameras), value.size))],
+        mask=of_each(known),
     )
 
 

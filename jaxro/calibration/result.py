@@ -15,7 +15,7 @@ from ..xla.passes import count
 from .brown import POWERS
 from .camera import Camera, Measured, Station, misfit
 from .images import Frame, MeasuredImage
-from .models import Model, field_weights, focal_weights
+from .models import Model, field_weights, parameter_weights
 from .problem import Observed
 from .results import RESULTS, is_usable
 from .zones import Area
@@ -174,7 +174,7 @@ class Calibration(eqx.Module):
 
     @property
     def degrees_of_freedom(self) -> Int[Array, ""]:
-        """Coordinates minus unknowns."""
+        """Coordinates, and numbers known beforehand, minus unknowns."""
         return self.adjustment.degrees_of_freedom
 
     @property
@@ -191,9 +191,7 @@ class Calibration(eqx.Module):
         their object points, in the unit of the image."""
         u = self.frame.normal_places(jnp.asarray(places, float))
         normal = self.frame.normal_points(jnp.asarray(points, float))
-        focal = jnp.einsum(
-            "pcz,zk->pck", focal_weights(self.model, u, self.area), self.basis
-        )
+        focal = parameter_weights(self.model, u, self.area, self.basis)
         field = field_weights(self.model, u, self.area)
         of_point = partial(misfit, self.model.rays, self.station, self.camera)
         found = jax.vmap(of_point)(Measured(u, normal, focal, field))

@@ -16,9 +16,8 @@ from jaxtyping import Array, Bool, Float
 from ..adjustment import symmetric
 from ..adjustment.guarded import root
 from ..geometry import rotations as rot
-from ..xla.passes import count
 from .camera import Station
-from .images import Places, Points
+from .images import Places, Points, about_centroid
 
 Mask = Bool[Array, " point"]
 Vector = Float[Array, "3"]
@@ -93,10 +92,7 @@ def _of_plane(u: Places, points: Points, mask: Mask, sign) -> Start:
 def thickness(points: Points, mask: Mask) -> Float[Array, ""]:
     """The root mean square distance of points from the plane nearest to them, over that
     from their centroid."""
-    use = mask[:, None]
-    number = jnp.maximum(count(mask), 1.0)
-    middle = jnp.sum(jnp.where(use, points, 0.0), axis=0) / number
-    apart = jnp.where(use, points - middle[None], 0.0)
+    _, apart = about_centroid(points, mask)
     moments = apart.T @ apart
     across = jnp.sum((apart @ plane_axes(moments)[2]) ** 2)
     extent = jnp.trace(moments)
@@ -123,10 +119,7 @@ class Homography(eqx.Module):
 
 def homography(u: Places, points: Points, mask: Mask) -> Homography:
     """The `Homography` of the points in use."""
-    use = mask[:, None]
-    number = jnp.maximum(count(mask), 1.0)
-    middle = jnp.sum(jnp.where(use, points, 0.0), axis=0) / number
-    apart = jnp.where(use, points - middle[None], 0.0)
+    middle, apart = about_centroid(points, mask)
     axes = plane_axes(apart.T @ apart)
     inside = apart @ axes.T
     m, last = _projection(u, inside[:, :2], mask)

@@ -11,19 +11,20 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from ..adjustment import RESULTS, JointAdjustment, LevenbergMarquardt, Term, adjust
-from ..xla.passes import count
+from ..adjustment import JointAdjustment, LevenbergMarquardt, Term, adjust
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .camera import Camera, Measured, Station, misfit
 from .first_stations import first_stations
-from .images import Frame
+from .images import Frame, frame_of
+from .known import NOTHING, prior
 from .measured_images import MeasuredImages
 from .models import Model, field_weights, focal_weights
-from .problem import FIXED, MAX_STEPS, flat
+from .problem import FIXED, MAX_STEPS, prior_term
+from .results import RESULTS, is_usable
+from .verdict import verdict_of_several
 from .zones import Area
 
 
@@ -36,11 +37,18 @@ class Together(eqx.Module):
     frame: Frame
     area: Area
     adjustment: JointAdjustment
+    result: RESULTS
 
     @property
     def usable(self) -> Bool[Array, ""]:
-        """Whether the adjustment came to rest and determines all unknowns."""
-        return self.adjustment.result == RESULTS.successful  # pyright: ignore[reportReturnType]
+        """Whether the numbers may be used."""
+        return is_usable(self.result)
+
+    def check(self) -> "Together":
+        """This calibration; RuntimeError with advice where it is not usable."""
+        if not bool(self.usable):
+            raise RuntimeError(f"calibrate_together: {RESULTS[self.result]}")
+        return self
 
     @property
     def sigma0(self) -> Float[Array, ""]:
@@ -137,11 +145,14 @@ def calibrate_together(
 
 
 def _adjust(measured: MeasuredImages, model: Model) -> Together:
-    given = _frame(measured)
+    every = jnp.ones(len(measured.places), bool)
+    known = jnp.all(jnp.isfinite(measured.point_sigma), axis=1)
+    given = frame_of(
+        measured.places, every, measured.points, known, measured.handedness
+    )
     u = given.normal_places(measured.places)
     begin = first_stations(measured, given, u)
-    use = jnp.ones(len(u), bool)
-    area = Area(u, use, given.half_sides, jnp.zeros(2))
+    area = Area(u, every, given.half_sides, jnp.zeros(2))
     cameras = measured.cameras
     focal, field = focal_weights(model, u, area), field_weights(model, u, area)
     sigma = measured.sigma / given.size
@@ -166,7 +177,10 @@ def _adjust(measured: MeasuredImages, model: Model) -> Together:
         ],
     )
     families = {"station": begin.stations, "camera": camera, "point": begin.points}
-    terms = [of_places, _known_points(measured, given), *_prior(model, camera, sigma)]
+    one = jax.tree.map(lambda a: a[0], camera)
+    mean = jnp.sqrt(jnp.mean(sigma**2))
+    beforehand = prior(model, one, NOTHING, given, mean, jnp.eye(focal.shape[2]))
+    terms = [of_places, _known_points(measured, given), prior_term(beforehand, cameras)]
     found = adjust(
         terms,
         families,
@@ -174,7 +188,7 @@ def _adjust(measured: MeasuredImages, model: Model) -> Together:
         solver=LevenbergMarquardt(),
         max_steps=MAX_STEPS,
     )
-    return Together(measured, model, given, area, found)
+    return Together(measured, model, given, area, found, verdict_of_several(found))
 
 
 def _known_points(measured: MeasuredImages, given: Frame) -> Term:
@@ -189,55 +203,6 @@ def _known_points(measured: MeasuredImages, given: Frame) -> Term:
         variance,
         touches=[("point", jnp.arange(len(measured.points)))],
         mask=known,
-    )
-
-
-def _prior(model: Model, camera: Camera, sigma: Float[Array, " place"]) -> list[Term]:
-    """The coefficients of the field, and those of the lens that are not unknowns, as
-    observations of zero."""
-    mean = jnp.sqrt(jnp.mean(sigma**2))
-    one = jax.tree.map(lambda a: a[0], camera)
-    none = (False,) * one.brown.size
-    free = np.array(none if model.brown is None else model.brown.free)
-    strength = 1.0 if model.field is None else model.field.strength
-    infinite = lambda a: jnp.full_like(a, jnp.inf)
-    variance = flat(
-        Camera(
-            principal=infinite(one.principal),
-            focal=infinite(one.focal),
-            brown=jnp.where(free, jnp.inf, (FIXED * mean) ** 2),
-            field=jnp.full_like(one.field, 1.0) * (strength * mean) ** 2,
-        )
-    )
-    known = jnp.isfinite(variance)
-    cameras, size = camera.principal.shape[0], variance.size
-    tile = lambda a: jnp.tile(a, cameras)
-    return [
-        Term(
-            lambda camera, row: flat(camera)[row[0]] - row[1],
-            (tile(jnp.arange(size)), jnp.zeros(cameras * size)),
-            (None, tile(jnp.where(known, variance, 1.0))),
-            touches=[("camera", jnp.repeat(jnp.arange(cameras), size))],
-            mask=tile(known),
-        )
-    ]
-
-
-def _frame(measured: MeasuredImages) -> Frame:
-    """The frame of all places, and of the known points."""
-    known = jnp.all(jnp.isfinite(measured.point_sigma), axis=1)
-    use = known[:, None]
-    number = jnp.maximum(count(known), 1.0)
-    middle = jnp.sum(jnp.where(use, measured.points, 0.0), axis=0) / number
-    apart = jnp.where(use, measured.points - middle[None], 0.0)
-    least, most = jnp.min(measured.places, axis=0), jnp.max(measured.places, axis=0)
-    return Frame(
-        centre=(least + most) / 2,
-        size=jnp.max(most - least) / 2,
-        half_sides=(most - least) / jnp.max(most - least),
-        middle=middle,
-        length=jnp.sqrt(jnp.sum(apart**2) / number),
-        handedness=measured.handedness,
     )
 
 

@@ -1,12 +1,11 @@
 """What the result of a calibration is called: a table in the order of precedence."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .. import adjustment
 from ..adjustment import JointAdjustment
 from .images import MeasuredImage
-from .models import Model
 from .results import RESULTS, of_adjustment
 from .starts import NEARLY_FLAT, thickness
 
@@ -24,34 +23,57 @@ determined."""
 
 def verdict(
     measured: MeasuredImage,
-    model: Model,
     free: Float[Array, ""],
     focal: Float[Array, "point 2 zone"],
     found: JointAdjustment,
 ) -> RESULTS:
     """The `RESULTS` of a finished adjustment; `free`: how many numbers of the inner
     orientation are."""
-    number = 2 * jnp.sum(measured.mask)
-    spare = number - model.unknowns
+    spare = found.degrees_of_freedom
     thick = thickness(measured.points, measured.mask)
-    station = found.parameters["station"]
-    deviations = jnp.sqrt(jnp.diagonal(found.covariance("station")[0])[3:])
-    distance = jnp.sqrt(jnp.sum(station.centre[0] ** 2))
-    weak = ~(jnp.max(deviations) <= WEAK * distance)
+    weak = _is_weak(found)
     plane = (thick < FLAT) | ((thick < NEARLY_FLAT) & weak)
     flat = plane & (free > OF_A_PLANE)
-    settled = found.result == adjustment.RESULTS.successful
     seen = jnp.any(focal != 0, axis=1) & measured.mask[:, None]
     support = jnp.sum(seen, axis=0)
-    # the first one that holds
-    table = (
+    return _first(
         (RESULTS.too_few_points, spare < 0),
         (RESULTS.empty_zone, jnp.any(support == 0)),
         (RESULTS.plane_object, flat),
+        *_of_all(found, weak),
+    )
+
+
+def verdict_of_several(found: JointAdjustment) -> RESULTS:
+    """The `RESULTS` of an adjustment of several images."""
+    few = RESULTS.too_few_points, found.degrees_of_freedom < 0
+    return _first(few, *_of_all(found, _is_weak(found)))
+
+
+Row = tuple[RESULTS, Bool[Array, ""]]
+
+
+def _of_all(found: JointAdjustment, weak: Bool[Array, ""]) -> tuple[Row, Row, Row]:
+    """What may be wrong with one image as with several."""
+    settled = found.result == adjustment.RESULTS.successful
+    return (
         (of_adjustment(found.result), ~settled),
-        (RESULTS.no_redundancy, spare == 0),
+        (RESULTS.no_redundancy, found.degrees_of_freedom == 0),
         (RESULTS.weakly_determined, weak),
     )
+
+
+def _is_weak(found: JointAdjustment) -> Bool[Array, ""]:
+    """Whether the deviation of a station is too large for its distance from the
+    object, which lies about zero."""
+    variances = jnp.diagonal(found.covariance("station"), axis1=1, axis2=2)[:, 3:]
+    centres = found.parameters["station"].centre
+    least = WEAK**2 * jnp.sum(centres**2, axis=1)
+    return ~jnp.all(jnp.max(variances, axis=1) <= least)
+
+
+def _first(*table: Row) -> RESULTS:
+    """The first result of a table that holds."""
     result = RESULTS.successful
     for name, holds in reversed(table):
         result = RESULTS.where(holds, name, result)  # pyright: ignore[reportArgumentType]

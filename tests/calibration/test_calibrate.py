@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles_calibration import gauss_newton, jacobian, rays, scene
+from oracles_calibration import gauss_newton, jacobian, rays, rotation, scene
 
 from jaxro import calibration
 from jaxro.calibration import RESULTS, Brown, Model, Whole
@@ -125,6 +125,13 @@ def test_distances_with_their_full_cofactor_are_the_coordinates(zones):
     np.testing.assert_allclose(by_distances.sigma0, by_coordinates.sigma0, rtol=1e-4)
     assert by_distances.degrees_of_freedom == by_coordinates.degrees_of_freedom
     np.testing.assert_allclose(by_distances.centre_deviations, deviations, rtol=1e-3)
+
+
+def test_distances_of_masked_points_are_refused():
+    _, points, places = measured(3)
+    some = calibration.image(*places.T, points, mask=np.arange(40) > 0)
+    with pytest.raises(ValueError, match="leave out the points"):
+        adjust_distances(some)
 
 
 def test_distances_in_numpy():
@@ -287,6 +294,38 @@ def test_too_little_is_named():
     assert found.result == RESULTS.empty_zone
     with pytest.raises(RuntimeError, match="A zone has no point"):
         found.check()
+
+
+def test_what_is_known_counts():
+    """Four points, with a known camera: eight coordinates, six unknowns."""
+    truth, points, places = measured(3)
+    few = np.arange(40) < 4
+    known = calibration.known(
+        principal=tuple(AT), principal_sigma=SIGMA, focal=60.0, focal_sigma=SIGMA
+    )
+    found = found_by_calibrate(points, places, mask=few, known=known)
+    assert found.degrees_of_freedom == 2
+    assert found.result in (RESULTS.successful, RESULTS.weakly_determined)
+    assert np.all(np.abs(found.centre - truth[3:]) < 0.1)
+
+
+@pytest.mark.parametrize("field", [60, 130])
+def test_stereographic_rays(field):
+    """Wide angles: the image that r = 2 f tan(angle / 2) makes."""
+    rng = np.random.default_rng(2)
+    angle, around = np.radians(rng.uniform(0, field / 2, 40)), rng.uniform(0, 6.28, 40)
+    distance = rng.uniform(3, 8, (40, 1))
+    across = np.column_stack([np.cos(around), np.sin(around)])
+    seen = np.column_stack([np.sin(angle)[:, None] * across, np.cos(angle)]) * distance
+    turn = np.diag([1.0, -1.0, -1.0]) @ rotation(0.2, -0.1, 1.0)
+    points = seen @ turn + [1.0, 2.0, 3.0]
+    places = 60 * 2 * np.tan(angle / 2)[:, None] * across + AT
+    places = places + rng.normal(0, SIGMA, places.shape)
+    found = found_by_calibrate(points, places, Model(rays=calibration.stereographic))
+    apart = np.abs(found.check().centre - np.array([1.0, 2.0, 3.0]))
+    assert np.all(apart < 4 * found.centre_deviations)
+    assert abs(found.focal[0] - 60) < 4 * found.focal_deviations[0]
+    assert 0.7 < found.sigma0 < 1.3
 
 
 def test_masked_points_change_nothing():

@@ -98,6 +98,23 @@ def test_what_does_not_hang_together_is_refused():
         calibration.images(*places.T, image, point + (point == 13), points)
 
 
+def test_images_that_do_not_determine_their_stations_are_named():
+    """A plane field of targets seen straight from above, without tilts: the distance
+    and the focal length can change together."""
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-3, 3, (14, 2)), np.zeros(14)])
+    above = [np.array([0, 0, 0.3 * k, x, 0.0, 9.0]) for k, x in enumerate((-1, 0, 1))]
+    places = np.concatenate([900 * rays(one, points) + [512, 384] for one in above])
+    places = places + rng.normal(0, SIGMA, places.shape)
+    image, point = np.repeat(np.arange(3), 14), np.tile(np.arange(14), 3)
+    found = calibration.calibrate_together(
+        calibration.images(*places.T, image, point, points, sigma=SIGMA)
+    )
+    assert not found.usable
+    with pytest.raises(RuntimeError, match="calibrate_together"):
+        found.check()
+
+
 def olympus(data):
     """The published calibration field: images, points, places in pixels, the known
     points; stations with their deviations (see SOURCE.txt there)."""
