@@ -15,6 +15,9 @@ from jaxtyping import Array, Float
 NAMES = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
 """The coefficients in their order; their units are powers of the unit of x."""
 
+COEFFICIENTS = len(NAMES)
+"""How many there are."""
+
 POWERS = (2, 4, 6, 1, 1, 0, 0)
 """The power of the unit of length by which each coefficient is divided."""
 

@@ -10,6 +10,7 @@ from a place to its ray is explicit: p = (m - t - A a + Brown) / W f.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
@@ -84,11 +85,30 @@ class Measured(NamedTuple):
     field: Float[Array, "2 mode"]
 
 
-Rays = Callable[[rot.Vector], tuple[Array, Array]]
+@dataclass(frozen=True, repr=False)
+class Rays:
+    """How a ray through the projection centre meets the image of the focal length 1:
+    its `image`, infinite where there is none, and the `direction` of an image."""
+
+    image: Callable[[rot.Vector], tuple[Array, Array]]
+    direction: Callable[[Pair], rot.Vector]
+
+    def __call__(self, ray: rot.Vector) -> tuple[Array, Array]:
+        return self.image(ray)
+
+    def __repr__(self) -> str:
+        # without addresses, which differ from process to process: compiled programs are
+        # kept under such texts
+        return f"Rays({_name(self.image)}, {_name(self.direction)})"
 
 
-def perspective(ray: rot.Vector) -> tuple[Array, Array]:
-    """Xc/Zc, Yc/Zc; infinite behind the camera."""
+def _name(function: Callable) -> str:
+    """Where a function is found; with its address, if it is not found by its name."""
+    name = f"{function.__module__}.{function.__qualname__}"
+    return f"{name} {id(function)}" if "<" in name else name
+
+
+def _perspective(ray: rot.Vector) -> tuple[Array, Array]:
     x, y, z = ray
     ahead = z > 0
     safe = jnp.where(ahead, z, 1.0)
@@ -96,14 +116,28 @@ def perspective(ray: rot.Vector) -> tuple[Array, Array]:
     return behind(x), behind(y)
 
 
-def stereographic(ray: rot.Vector) -> tuple[Array, Array]:
-    """2 Xc / (|Xc| + Zc), 2 Yc / (|Xc| + Zc): for fields of view beyond some 100°."""
+def _stereographic(ray: rot.Vector) -> tuple[Array, Array]:
     x, y, z = ray
     sum_ = jnp.sqrt(rot.dot(ray, ray)) + z
     seen = sum_ > 0
     safe = jnp.where(seen, sum_, 1.0)
     opposite = lambda value: jnp.where(seen, 2 * value / safe, jnp.inf)
     return opposite(x), opposite(y)
+
+
+def _perspective_direction(p: Pair) -> rot.Vector:
+    return p[0], p[1], jnp.ones_like(p[0])
+
+
+def _stereographic_direction(p: Pair) -> rot.Vector:
+    return p[0], p[1], 1 - (p[0] * p[0] + p[1] * p[1]) / 4
+
+
+perspective = Rays(_perspective, _perspective_direction)
+"""Xc/Zc, Yc/Zc; infinite behind the camera."""
+
+stereographic = Rays(_stereographic, _stereographic_direction)
+"""2 Xc / (|Xc| + Zc), 2 Yc / (|Xc| + Zc): for fields of view beyond some 100°."""
 
 
 def corrected(camera: Camera, measured: Measured) -> Pair:

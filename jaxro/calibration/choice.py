@@ -14,7 +14,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,12 +25,13 @@ from ..xla.programs import Program
 from ..xla.settings import MOMENT, settings_for
 from .brown import Brown
 from .calibrate import calibrate, first_start, observe
-from .camera import Camera, Rays, perspective
-from .field import MODES, Field
+from .camera import Rays, perspective
+from .field import Field
 from .images import MeasuredImage, frame
-from .known import NOTHING, Known, prior
-from .models import Model, field_weights, imitating, parameter_weights
-from .problem import FIXED, Observed, Prior, solve
+from .known import NOTHING, Known
+from .models import Model
+from .padded import Common, Padded, pad
+from .problem import solve
 from .result import Calibration
 from .starts import Start
 from .zones import Area, Whole
@@ -70,32 +70,26 @@ class Comparison(NamedTuple):
         return self.models[int(np.argmin(np.asarray(self.figures.score)))]
 
 
-class _Padded(eqx.Module):
-    """A model as arrays of the same shapes for all models."""
-
-    focal: Float[Array, "point 2 parameter"]
-    field: Float[Array, "point 2 mode"]
-    prior: Prior
-    camera: Camera
-    strength: Float[Array, ""]
-    unknowns: Float[Array, ""]
-
-
 def default_models(rays: Rays = perspective) -> tuple[Model, ...]:
-    """One focal length; two; Brown's lens with one, two or three radial coefficients
-    and with all; a displacement field of several lengths and strengths, alone and with
-    Brown's lens."""
-    square = {"affinity": False, "shear": False}
-    lenses = [Brown(k, tangential=False, **square) for k in (1, 2, 3)]
-    lenses += [Brown(2, **square), Brown(3, **square), Brown(shear=False), Brown()]
-    plain = [Model(), Model(y=Whole()), *(Model(brown=lens) for lens in lenses)]
+    """The `plain_models`, and a displacement field of several lengths and strengths,
+    alone and with Brown's lens."""
     fields = [
         Model(brown=lens, field=Field(length, strength))
         for lens in (None, Brown())
         for length in LENGTHS
         for strength in STRENGTHS
     ]
-    return tuple(dataclasses.replace(model, rays=rays) for model in [*plain, *fields])
+    models = [*plain_models(), *fields]
+    return tuple(dataclasses.replace(model, rays=rays) for model in models)
+
+
+def plain_models() -> list[Model]:
+    """One focal length; two; Brown's lens with one, two or three radial coefficients
+    and with all."""
+    square = {"affinity": False, "shear": False}
+    lenses = [Brown(k, tangential=False, **square) for k in (1, 2, 3)]
+    lenses += [Brown(2, **square), Brown(3, **square), Brown(shear=False), Brown()]
+    return [Model(), Model(y=Whole()), *(Model(brown=lens) for lens in lenses)]
 
 
 def compare(
@@ -132,51 +126,17 @@ def _compare(
     given = frame(measured, first.handedness)
     observed = observe(measured, given)
     area = Area(observed.places, measured.mask, given.half_sides, first.principal)
-    most = max(model.focals for model in models)
-    fields: dict = {}  # those that differ in their strength alone have the same columns
+    common = Common(
+        places=observed.places,
+        area=area,
+        known=known,
+        frame=given,
+        sigma=observed.sigma,
+        focal=first.focal,
+        principal=first.principal,
+    )
 
-    def pad(model: Model) -> _Padded:
-        basis = imitating(model, area)
-        focal = parameter_weights(model, observed.places, area, basis)
-        missing = most - focal.shape[2]
-        none = model.field is None
-        key = None if model.field is None else (model.field.length, model.brown)
-        if key not in fields:
-            columns = jnp.zeros((len(observed.places), 2, 2 * MODES))
-            fields[key] = (
-                columns if none else field_weights(model, observed.places, area)
-            )
-        strength = 1.0 if model.field is None else model.field.strength
-        camera = Camera(
-            principal=first.principal,
-            focal=first.focal * jnp.sum(basis, axis=0),
-            brown=jnp.zeros(7),
-            field=jnp.zeros(2 * MODES),
-        )
-        beforehand = prior(model, camera, known, given, observed.sigma, basis)
-        fixed = (FIXED * observed.sigma) ** 2
-        longer = lambda a, value: jnp.pad(a, (0, missing), constant_values=value)
-        at_focal = lambda c: c.focal
-        value = eqx.tree_at(
-            at_focal, beforehand.value, longer(beforehand.value.focal, 0.0)
-        )
-        variance = eqx.tree_at(
-            at_focal,
-            beforehand.variance,
-            jnp.concatenate(
-                [beforehand.variance.focal, jnp.broadcast_to(fixed, (missing,))]
-            ),
-        )
-        return _Padded(
-            focal=jnp.pad(focal, ((0, 0), (0, 0), (0, missing))),
-            field=fields[key],
-            prior=Prior(value, variance),
-            camera=eqx.tree_at(at_focal, camera, longer(camera.focal, 0.0)),
-            strength=jnp.asarray(strength, float),
-            unknowns=jnp.asarray(model.unknowns, float),
-        )
-
-    def adjust(padded: _Padded) -> Figures:
+    def adjust(padded: Padded) -> Figures:
         found = solve(
             observed,
             padded.focal,
@@ -185,32 +145,57 @@ def _compare(
             models[0].rays,
             (first.station, padded.camera),
         )
-        return _assess(found, padded, observed)
+        return assess(found, padded, observed.sigma, 2 * count(observed.mask))
 
-    every = jax.tree.map(lambda *a: jnp.stack(a), *map(pad, models))
+    every = jax.tree.map(lambda *a: jnp.stack(a), *pad(models, common))
     return jax.vmap(adjust)(every)
 
 
-def _assess(found: JointAdjustment, padded: _Padded, observed: Observed) -> Figures:
-    """The figures of one adjustment."""
-    number = 2 * count(observed.mask)
-    squares = sum(jnp.sum(r**2) for r in found.residuals)
-    begin = found.normal_matrix.shape[0] - padded.field.shape[2]
-    own = found.normal_matrix[begin:, begin:]
-    pivots = symmetric.inverse(own).pivots
-    variance = (padded.strength * observed.sigma) ** 2
-    tiny = jnp.finfo(pivots.dtype).tiny
-    logs = jnp.log(jnp.maximum(pivots, tiny)) + jnp.log(jnp.diagonal(own) * variance)
-    score = number * jnp.log(squares / number) + jnp.sum(logs)
-    score = score + padded.unknowns * jnp.log(number)
+def assess(
+    found: JointAdjustment,
+    padded: Padded,
+    sigma: Float[Array, ""],
+    number: Float[Array, ""],
+) -> Figures:
+    """The figures of one adjustment; `number`: of coordinates, less the coordinates of
+    the points that were eliminated."""
+    modes, cameras = padded.field.shape[2], found.layout["camera"].members
+    squares: Array = sum(jnp.sum(r**2) for r in found.residuals)  # pyright: ignore[reportAssignmentType]
+    at = fields_of(found, modes)
+    own = found.normal_matrix[jnp.ix_(at, at)]
+    score = evidence(squares, own, padded.strength * sigma, number)
+    score = score + cameras * padded.unknowns * jnp.log(number)
     redundancy = found.redundancy[0]
     apart = found.residuals[0] / jnp.where(redundancy > 0, redundancy, 1.0)
+    used = jnp.sum(jnp.where(redundancy > 0, 1.0, 0.0))
     settled = found.result == RESULTS.successful
     usable = settled & jnp.isfinite(score) & (found.degrees_of_freedom > 0)
     return Figures(
         score=jnp.where(usable, score, jnp.inf),
         sigma0=found.sigma0,
-        left_out=jnp.sqrt(jnp.sum(apart**2) / number),
+        left_out=jnp.sqrt(jnp.sum(apart**2) / jnp.maximum(used, 1.0)),
         effective=number - jnp.sum(redundancy),
         degrees_of_freedom=found.degrees_of_freedom,
     )
+
+
+def evidence(
+    squares: Float[Array, ""],
+    own: Float[Array, "mode mode"],
+    deviation: Float[Array, ""],
+    number: Float[Array, ""],
+) -> Float[Array, ""]:
+    """N log(S / N) + log det(I + γ² AᵀA), from `own`, the normal matrix AᵀA + I/γ² of
+    the field's coefficients, and their a priori standard deviation γ."""
+    score = number * jnp.log(squares / number)
+    if len(own) == 0:
+        return score
+    pivots = jnp.maximum(symmetric.inverse(own).pivots, jnp.finfo(own.dtype).tiny)
+    return score + jnp.sum(jnp.log(pivots * jnp.diagonal(own) * deviation**2))
+
+
+def fields_of(found: JointAdjustment, modes: int) -> Int[Array, " mode"]:
+    """Where the coefficients of all fields stand in the normal matrix."""
+    block = found.layout["camera"]
+    places = found.layout.places("camera", jnp.arange(block.members))
+    return places[:, block.size - modes :].reshape(-1)

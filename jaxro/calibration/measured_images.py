@@ -96,11 +96,13 @@ def images(
 
 
 def _rows(image: np.ndarray, number: int) -> np.ndarray:
-    """The places of each image, (image, most), filled with the number of places."""
+    """The places of each image in random order, (image, most), filled with the number
+    of places."""
     counts = np.bincount(image, minlength=number)
     rows = np.full((number, counts.max()), len(image))
+    rng = np.random.default_rng(0)
     for k in range(number):
-        rows[k, : counts[k]] = np.flatnonzero(image == k)
+        rows[k, : counts[k]] = rng.permutation(np.flatnonzero(image == k))
     return rows
 
 

@@ -11,18 +11,18 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from ..adjustment import JointAdjustment, LevenbergMarquardt, Term, adjust
+from ..adjustment import JointAdjustment
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .camera import Camera, Measured, Station, misfit
-from .first_stations import first_stations
-from .images import Frame, frame_of
+from .images import Frame
 from .known import NOTHING, prior
 from .measured_images import MeasuredImages
 from .models import Model, field_weights, focal_weights
-from .problem import FIXED, MAX_STEPS, prior_term
+from .problem_together import approximate, solve_together
 from .results import RESULTS, is_usable
 from .verdict import verdict_of_several
 from .zones import Area
@@ -128,9 +128,13 @@ class Together(eqx.Module):
 
 
 def calibrate_together(
-    measured: MeasuredImages, model: Model | None = None
+    measured: MeasuredImages, model: Model | None = None, *, free_network: bool = False
 ) -> Together:
     """Adjust several images together; unknown points are eliminated.
+
+    In a free network the known points give approximate values only; the datum is that
+    of the stations' approximate values (inner constraints), to which all standard
+    deviations refer.
 
     A field, focal lengths and the lens are those of each camera. Zones of focal lengths
     that change linearly are for single images.
@@ -141,68 +145,35 @@ def calibrate_together(
             "calibrate_together: focal lengths that change linearly imitate tilts; take "
             "a field, or zones of degree 0"
         )
-    return Program(_adjust, {"model": model}, COMPILE_FAST)(measured)
+    static = {"model": model, "free_network": free_network}
+    return Program(_adjust, static, COMPILE_FAST)(measured)
 
 
-def _adjust(measured: MeasuredImages, model: Model) -> Together:
-    every = jnp.ones(len(measured.places), bool)
-    known = jnp.all(jnp.isfinite(measured.point_sigma), axis=1)
-    given = frame_of(
-        measured.places, every, measured.points, known, measured.handedness
-    )
-    u = given.normal_places(measured.places)
-    begin = first_stations(measured, given, u)
-    area = Area(u, every, given.half_sides, jnp.zeros(2))
-    cameras = measured.cameras
+def _adjust(measured: MeasuredImages, model: Model, free_network: bool) -> Together:
+    begin = approximate(measured, model.rays)
+    u, area = begin.places, begin.area
     focal, field = focal_weights(model, u, area), field_weights(model, u, area)
-    sigma = measured.sigma / given.size
-    size = 0 if model.brown is None else 7
-    camera = Camera(
-        principal=jnp.tile(jnp.median(begin.inner.principal, axis=0), (cameras, 1)),
-        focal=jnp.full((cameras, focal.shape[2]), jnp.median(begin.inner.focal)),
-        brown=jnp.zeros((cameras, size)),
-        field=jnp.zeros((cameras, field.shape[2])),
+    number, zones = measured.cameras, focal.shape[2]
+    free = np.array(() if model.brown is None else model.brown.free, bool)
+    cameras = Camera(
+        principal=begin.cameras.principal,
+        focal=jnp.broadcast_to(begin.cameras.focal, (number, zones)),
+        brown=jnp.where(free[None], begin.cameras.brown[:, : free.size], 0.0),
+        field=jnp.zeros((number, field.shape[2])),
     )
-    condition = lambda station, camera, point, seen: misfit(
-        model.rays, station, camera, Measured(seen[0], point, seen[1], seen[2])
+    one = jax.tree.map(lambda a: a[0], cameras)
+    known = prior(model, one, NOTHING, begin.frame, begin.sigma, jnp.eye(zones))
+    families = {"station": begin.stations, "camera": cameras, "point": begin.points}
+    found = solve_together(
+        measured, begin, focal, field, known, model.rays, families, free_network
     )
-    of_places = Term(
-        condition,
-        (u, focal, field),
-        (sigma**2, None, None),
-        touches=[
-            ("station", measured.image),
-            ("camera", measured.camera[measured.image]),
-            ("point", measured.point),
-        ],
-    )
-    families = {"station": begin.stations, "camera": camera, "point": begin.points}
-    one = jax.tree.map(lambda a: a[0], camera)
-    mean = jnp.sqrt(jnp.mean(sigma**2))
-    beforehand = prior(model, one, NOTHING, given, mean, jnp.eye(focal.shape[2]))
-    terms = [of_places, _known_points(measured, given), prior_term(beforehand, cameras)]
-    found = adjust(
-        terms,
-        families,
-        eliminate="point",
-        solver=LevenbergMarquardt(),
-        max_steps=MAX_STEPS,
-    )
-    return Together(measured, model, given, area, found, verdict_of_several(found))
-
-
-def _known_points(measured: MeasuredImages, given: Frame) -> Term:
-    """The object points as observations of what is known of them."""
-    least = FIXED * jnp.min(measured.sigma) / given.size
-    deviation = jnp.maximum(measured.point_sigma / given.length, least)
-    known = jnp.all(jnp.isfinite(deviation), axis=1)
-    variance = jnp.where(known[:, None], deviation, 1.0) ** 2
-    return Term(
-        lambda point, at: point - at,
-        given.normal_points(measured.points),
-        variance,
-        touches=[("point", jnp.arange(len(measured.points)))],
-        mask=known,
+    return Together(
+        measured=measured,
+        model=model,
+        frame=begin.frame,
+        area=area,
+        adjustment=found,
+        result=verdict_of_several(found),
     )
 
 

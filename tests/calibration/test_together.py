@@ -2,31 +2,11 @@
 
 import numpy as np
 import pytest
-from oracles_calibration import gauss_newton, rays, rotation
+from oracles_calibration import gauss_newton, rays
+from several_images import SIGMA, olympus, photos
 
 from jaxro import calibration
-from jaxro.calibration import Brown, Field, Model
-
-SIGMA = 0.05
-
-
-def photos(rng, points, images=4):
-    """Truth (omega, phi, kappa, X, Y, Z of each image), and places of all points with a
-    focal length of 900 about (512, 384), y down; only every second point is seen in the
-    last image."""
-    truth, places = [], []
-    for k in range(images):
-        angles = np.array([0.3 * (-1) ** k, 0.25 * (k - 1.5), 0.4 * k])
-        turn = rotation(*angles)
-        station = turn.T @ np.array([0.0, 0.0, 9.0 + k])
-        truth.append([*angles, *station])
-        places.append(900 * rays(np.array(truth[-1]), points) + [512, 384])
-    image = np.repeat(np.arange(images), len(points))
-    point = np.tile(np.arange(len(points)), images)
-    seen = (image < images - 1) | (point % 2 == 0)
-    places = np.concatenate(places)[seen]
-    places = places + rng.normal(0, SIGMA, places.shape)
-    return np.array(truth), image[seen], point[seen], places
+from jaxro.calibration import Brown, Model
 
 
 @pytest.mark.parametrize("depth", [0.0, 2.0])
@@ -83,6 +63,82 @@ def test_stations_and_points_are_those_of_a_dense_adjustment(depth):
     np.testing.assert_allclose(left.ravel(), -SIGMA * residuals(x), atol=1e-5)
 
 
+def test_a_free_network_has_the_inner_geometry_of_any_datum():
+    """Focal length, its standard deviation and sigma0 are those of a dense adjustment
+    whose datum is one station and a coordinate of the next; and the stations have the
+    smallest variances, whose datum moves none of them as a whole."""
+    rng = np.random.default_rng(6)
+    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (12, 3))
+    truth, image, point, places = photos(rng, points)
+
+    def residuals(unknowns):
+        stations = np.concatenate([truth[0], truth[1, :3], unknowns[:2], truth[1, 5:]])
+        stations = np.concatenate([stations, unknowns[2:14]]).reshape(4, 6)
+        stations[1, :3] = unknowns[17:20]
+        moved = unknowns[20:].reshape(-1, 3)
+        found = [
+            rays(stations[i], moved[[p]])[0] for i, p in zip(image, point, strict=True)
+        ]
+        return (
+            (places - unknowns[15:17] - unknowns[14] * np.array(found)) / SIGMA
+        ).ravel()
+
+    inner = [900, 512, 384, *truth[1, :3]]
+    begin = [*truth[1, 3:5], *truth[2:].ravel(), *inner, *points.ravel()]
+    x, q = gauss_newton(residuals, np.array(begin), 8)
+    freedom = 2 * len(places) - len(x)
+    sigma0 = np.sqrt(np.sum(residuals(x) ** 2) / freedom)
+
+    rough = points + rng.normal(0, 0.01, points.shape)
+    measured = calibration.images(*places.T, image, point, rough, sigma=SIGMA)
+    found = calibration.calibrate_together(measured, free_network=True)
+    assert found.usable and int(found.adjustment.degrees_of_freedom) == freedom
+    np.testing.assert_allclose(found.sigma0, sigma0, rtol=1e-6)
+    np.testing.assert_allclose(found.focal[0, 0], x[14], rtol=1e-6)
+    deviation = sigma0 * np.sqrt(q[14, 14])
+    np.testing.assert_allclose(found.focal_deviations[0, 0], deviation, rtol=1e-3)
+    held = calibration.calibrate_together(measured)
+    assert np.all(found.centre_deviations < held.centre_deviations)
+
+
+def test_variance_components_of_places_and_known_points():
+    """Places are twice as good as was said, control points three times as bad."""
+    rng = np.random.default_rng(7)
+    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (60, 3))
+    _, image, point, places = photos(rng, points)
+    known = np.arange(60) < 40
+    given = np.where(known[:, None], points + rng.normal(0, 0.003, (60, 3)), np.nan)
+    measured = calibration.images(
+        *places.T, image, point, given, sigma=2 * SIGMA, point_sigma=0.001
+    )
+    found = calibration.estimate_components(measured)
+    assert found.settled
+    assert np.all(np.abs(found.factors - [0.5, 3.0]) < 3 * found.deviations)
+    assert np.all(found.deviations < 0.1 * found.factors)
+    np.testing.assert_allclose(found.found.sigma0, 1.0, atol=0.01)
+    fixed = calibration.images(*places.T, image, point, given, sigma=SIGMA)
+    with pytest.raises(ValueError, match="known points need standard deviations"):
+        calibration.estimate_components(fixed)
+
+
+def test_cameras_of_their_own():
+    """Two cameras of different focal lengths took two images each."""
+    rng = np.random.default_rng(8)
+    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (40, 3))
+    truth, image, point, places = photos(rng, points)
+    second = image >= 2
+    places[second] = (places[second] - [512, 384]) * 1.2 + [500, 390]
+    measured = calibration.images(
+        *places.T, image, point, points, sigma=SIGMA, camera=np.array([0, 0, 1, 1])
+    )
+    found = calibration.calibrate_together(measured)
+    assert found.usable and 0.8 < float(found.sigma0) < 1.25
+    apart = np.asarray(found.focal)[:, 0] - [900, 1080]
+    assert np.all(np.abs(apart) < 4 * found.focal_deviations[:, 0])
+    apart = np.asarray(found.centres) - truth[:, 3:]
+    assert np.all(np.abs(apart) < 4 * found.centre_deviations)
+
+
 def test_what_does_not_hang_together_is_refused():
     rng = np.random.default_rng(4)
     points = rng.uniform(-3, 3, (14, 3))
@@ -115,23 +171,6 @@ def test_images_that_do_not_determine_their_stations_are_named():
         found.check()
 
 
-def olympus(data):
-    """The published calibration field: images, points, places in pixels, the known
-    points; stations with their deviations (see SOURCE.txt there)."""
-    folder = data / "olympus_camcal"
-    rows = np.loadtxt(folder / "markpts.txt", delimiter=",")
-    image = rows[:, 0].astype(int) - 1
-    names, point = np.unique(rows[:, 1].astype(int), return_inverse=True)
-    points = np.full((len(names), 3), np.nan)
-    known = np.loadtxt(folder / "camcal-fixed.txt", delimiter=",", usecols=(0, 2, 3, 4))
-    points[np.searchsorted(names, known[:, 0].astype(int))] = known[:, 1:]
-    columns = (1, 2, 3, 7, 8, 9)
-    stations = np.loadtxt(
-        folder / "published_eo.csv", delimiter=",", skiprows=1, usecols=columns
-    )
-    return image, point, rows[:, 2:4], points, stations
-
-
 MILLIMETRES = 5.43764 / 1704  # of a pixel
 
 
@@ -148,20 +187,3 @@ def test_a_published_camera(data):
     assert abs(x - 3.61546) < 0.00082 and abs(y - 2.61329) < 0.00098
     apart = (np.asarray(found.centres) - stations[:, :3]) / stations[:, 3:]
     assert np.sqrt(np.mean(apart**2)) < 0.5
-
-
-@pytest.mark.slow
-def test_a_field_predicts_places_that_were_held_out(data):
-    image, point, places, points, _ = olympus(data)
-    held = np.random.default_rng(0).random(len(image)) < 0.2
-    errors = []
-    for model in (
-        Model(brown=Brown(shear=False)),
-        Model(brown=Brown(), field=Field(0.5, 1.0)),
-    ):
-        train = places[~held].T, image[~held], point[~held]
-        measured = calibration.images(*train[0], *train[1:], points, sigma=0.1)
-        found = calibration.calibrate_together(measured, model)
-        left = found.residuals(places[held], image[held], point[held])
-        errors.append(np.sqrt(np.mean(np.asarray(left) ** 2)))
-    assert errors[1] < 0.95 * errors[0]

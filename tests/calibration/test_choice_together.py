@@ -1,0 +1,98 @@
+"""Which model several images need, and the strength of its field."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles_calibration import rays
+from several_images import SIGMA, olympus, photos
+
+from jaxro import calibration
+from jaxro.calibration import Brown, Field, Model
+from jaxro.calibration.choice_together import STRENGTHS, adjust_model
+from jaxro.calibration.problem_together import approximate
+
+
+def deformed(places):
+    """Places on a film that is deformed by waves of 20 sigma."""
+    u = (places - [512, 384]) / 300
+    return places + 20 * SIGMA * np.stack([np.sin(2 * u[:, 1]), np.cos(3 * u[:, 0])], 1)
+
+
+def survey(seed, points=50):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (points, 3))
+    truth, image, point, places = photos(rng, points)
+    return points, truth, image, point, places
+
+
+def test_the_linear_problem_tells_the_evidence_of_all_strengths():
+    """The scores that the adjustment with one strength predicts for others are those of
+    adjustments with these, within a hundredth of what divides them."""
+    points, _, image, point, places = survey(0)
+    measured = calibration.images(
+        *deformed(places).T, image, point, points, sigma=SIGMA
+    )
+    begin = approximate(measured, calibration.perspective)
+    model = (Model(field=Field(0.8, 1.0)),)
+
+    def tried(number):
+        strength = jnp.asarray(STRENGTHS[number])
+        return adjust_model((measured, begin, jnp.asarray(0), strength), model)
+
+    first, second = tried(13), tried(16)
+    unknowns = model[0].unknowns * np.log(2.0 * len(places))
+    for one in (first, second):
+        scores = np.asarray(one.scores) + unknowns
+        apart = abs(scores[13] - scores[16])
+        assert apart > 10
+        np.testing.assert_allclose(scores[13], first.figures.score, atol=0.01 * apart)
+        np.testing.assert_allclose(scores[16], second.figures.score, atol=0.01 * apart)
+
+
+@pytest.mark.parametrize("bent", [True, False])
+def test_a_field_is_chosen_where_there_is_one(bent):
+    """With a deformed film the field predicts new places far better than one focal
+    length; without deformation one focal length is chosen."""
+    points, truth, image, point, places = survey(1)
+    taken = deformed(places) if bent else places
+    measured = calibration.images(*taken.T, image, point, points, sigma=SIGMA)
+    models = [Model(), Model(brown=Brown()), Model(field=Field(0.8, 1.0))]
+    found, compared = calibration.choose_together(measured, models)
+    assert found.usable
+    assert (compared.best.field is not None) == bent
+    assert 0.85 < float(found.sigma0) < 1.15
+    if bent:
+        new = np.random.default_rng(2).uniform([-2, -2, -1], [2, 2, 1], (60, 3))
+        there = 900 * rays(truth[1], new) + [512, 384]
+        u = np.asarray(found.frame.normal_places(jnp.asarray(deformed(there))))
+        inside = np.all(np.abs(u) < np.asarray(found.frame.half_sides), axis=1)
+        again = np.full(60, 1), np.arange(60)
+        errors = []
+        for one in (found, calibration.calibrate_together(measured)):
+            predicted = residuals(one, deformed(there), new, *again)[inside]
+            errors.append(np.sqrt(np.mean(predicted**2)))
+        assert errors[0] < 0.2 * errors[1]
+
+
+def residuals(found, places, points, image, point):
+    """The residuals of new points with known coordinates."""
+    normal = found.frame.normal_points(jnp.asarray(points))
+    with_new = eqx.tree_at(lambda f: f.adjustment.parameters["point"], found, normal)
+    return np.asarray(with_new.residuals(places, image, point))
+
+
+@pytest.mark.slow
+def test_the_choice_predicts_places_that_were_held_out(data):
+    """Of the published camera: better than Brown with affinity by a twentieth."""
+    image, point, places, points, _ = olympus(data)
+    held = np.random.default_rng(0).random(len(image)) < 0.2
+    train = places[~held].T, image[~held], point[~held]
+    measured = calibration.images(*train[0], *train[1:], points, sigma=0.1)
+    chosen, _ = calibration.choose_together(measured)
+    lens = calibration.calibrate_together(measured, Model(brown=Brown(shear=False)))
+    errors = [
+        np.sqrt(np.mean(np.square(f.residuals(places[held], image[held], point[held]))))
+        for f in (chosen, lens)
+    ]
+    assert errors[0] < 0.95 * errors[1]
