@@ -1,5 +1,5 @@
-"""The command line: `jaxro orient`, `clean`, `colmap`, `compare`, `reproduce`,
-`heights`, `plan`.
+"""The command line: `jaxro orient`, `clean`, `calibrate`, `colmap`, `compare`,
+`reproduce`, `heights`, `plan`.
 
 Exit code 0: every pair has usable elements; 1: at least one has not; 2: the input could
 not be used.
@@ -17,6 +17,7 @@ except ModuleNotFoundError:
     ) from None
 
 from .commands import options as given
+from .commands.calibration_line import calibrate
 from .commands.ending import end
 from .commands.options import Engine, Residual
 from .experiments import REPRODUCTIONS
@@ -167,6 +168,9 @@ def clean(
         end(lambda: large.run(options, how, choose_procedure(name, changes)))
     else:
         end(lambda: run(options, name, changes))
+
+
+app.command()(calibrate)
 
 
 @app.command()

@@ -9,7 +9,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..adjustment.guarded import root
-from .camera import Measured, corrected, scale
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
+from .camera import Camera, Measured, corrected, scale
+from .images import Places
 from .models import field_weights, parameter_weights
 from .result import Calibration
 
@@ -38,26 +41,49 @@ def correct(found: Calibration, places: Float[ArrayLike, "n 2"]) -> Corrected:
     Deviations are of first order.
     """
     places = jnp.asarray(places, float)
-    u = found.frame.normal_places(places)
-    weights = parameter_weights(found.model, u, found.area, found.basis)
-    field = field_weights(found.model, u, found.area)
-    focal = jnp.mean(found.basis @ found.camera.focal)
-    measured = Measured(u, jnp.zeros((len(u), 3)), weights, field)
-    ideal = lambda camera, one: focal * corrected(camera, one) / scale(camera, one)
-    at = jax.vmap(partial(ideal, found.camera))(measured)
-    slopes = jax.vmap(partial(jax.jacfwd(ideal), found.camera))(measured)
-    j = jnp.concatenate(jax.tree.leaves(slopes), axis=2)
+    at, deviations, sigma, focal = Program(_correct, {}, COMPILE_FAST)((found, places))
+    return Corrected(
+        places=at,
+        deviations=deviations,
+        sigma=sigma,
+        inside=_among(found, np.asarray(places)),
+        focal=focal,
+    )
+
+
+def _correct(data: tuple[Calibration, Float[Array, "n 2"]]) -> tuple[Array, ...]:
+    """Places, deviations, sigma and focal length of `Corrected`."""
+    found, places = data
+    at, slopes = ideal(found, found.frame.normal_places(places))
     own = found.covariance[6:, 6:]
-    variances = jnp.einsum("nci,ij,ncj->nc", j, own, j)
+    variances = jnp.einsum("nci,ij,ncj->nc", slopes, own, slopes)
     mean = jnp.sqrt(jnp.mean(found.measured.sigma**2, where=found.measured.mask))
     upward = jnp.array([1.0, -1.0])[None] * found.frame.size
-    return Corrected(
-        places=at * upward,
-        deviations=root(variances) * found.frame.size,
-        sigma=found.sigma0 * mean,
-        inside=_among(found, np.asarray(places)),
-        focal=focal * found.frame.size,
+    focal = jnp.mean(found.basis @ found.camera.focal)
+    return (
+        at * upward,
+        root(variances) * found.frame.size,
+        found.sigma0 * mean,
+        focal * found.frame.size,
     )
+
+
+def ideal(
+    found: Calibration, u: Places
+) -> tuple[Float[Array, "point 2"], Float[Array, "point 2 p"]]:
+    """Places of an ideal camera from places u of the frame, and their derivatives by
+    all parameters of the camera, in the units of the frame."""
+    weights = parameter_weights(found.model, u, found.area, found.basis)
+    field = field_weights(found.model, u, found.area)
+    measured = Measured(u, jnp.zeros((len(u), 3)), weights, field)
+    focal = jnp.mean(found.basis @ found.camera.focal)
+
+    def place(camera: Camera, one: Measured) -> Array:
+        return focal * corrected(camera, one) / scale(camera, one)
+
+    at = jax.vmap(partial(place, found.camera))(measured)
+    slopes = jax.vmap(partial(jax.jacfwd(place), found.camera))(measured)
+    return at, jnp.concatenate(jax.tree.leaves(slopes), axis=2)
 
 
 def _among(found: Calibration, places: np.ndarray) -> Bool[np.ndarray, " n"]:

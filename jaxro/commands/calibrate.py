@@ -1,0 +1,359 @@
+"""One call of `jaxro calibrate` from its options to its report and files."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from .. import calibration
+from ..calibration import Calibration, MeasuredImage, Model
+from ..calibration.distances import DistanceAdjustment, adjust_distances
+from ..calibration.of_image import of_image
+from ..calibration.starts import NEARLY_FLAT
+from ..reports import calibration as report
+from ..reports.calibration_files import contents
+from ..reports.calibration_model import (
+    Distances,
+    Done,
+    ObjectPoints,
+    Photo,
+    Variant,
+    corrections,
+    photo,
+    variants,
+    zone_names,
+)
+from ..reports.terminal import consoles, progress, say_compiling, say_what
+from ..tables import whole
+from ..tables.fields import TableError
+from ..tables.images import NamedImages
+from ..xla import programs
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
+from .calibration_request import Options, Task, prepare
+from .corrected import Wanted, corrected_texts, read_wanted
+
+LEAST_ROOM = 32
+"""Points for which the program of a single image is compiled at least; further ones
+double it, so that images of different lengths share their programs."""
+
+SUPPORT = 4
+"""Points that a focal length of a zone needs."""
+
+MIRRORED = 2.0
+"""How many times larger sigma0 is with the wrong direction of y, at least."""
+
+
+def run(options: Options) -> bool:
+    """Read, calibrate, show, write. True if every image has usable numbers. Raises
+    TableError, with nothing written."""
+    console, errors = consoles()
+    read = (options.file, options.object, options.correct)
+    inputs, texts, warnings = whole.Inputs(*read), {}, []
+    with whole.claim(options.out, whole.check_target, options.force):
+        task = prepare(options)
+        asked = read_wanted(options, task.named)
+        programs.watch(lambda _: say_compiling((len(task.named.image),)))
+        with progress(errors, "Calibrating", len(task.named.images)) as told:
+            done = calibrate(options, task, told)
+        if options.out is not None:
+            with say_what("Correcting ..."):
+                texts, warnings = write_texts(done, asked)
+            inputs.check()
+            whole.write(options.out, texts, read)
+    report.show(console, done)
+    for warning in warnings:
+        errors.print(f"Warning: {warning}", style="yellow", markup=False)
+    if texts:
+        console.print(f"Written to {options.out}: {', '.join(texts)}", markup=False)
+    if options.file is None:
+        console.print(
+            "This was a simulated example. Your own image: jaxro calibrate IMAGE.csv "
+            "--object POINTS.csv",
+            markup=False,
+        )
+    return done.usable
+
+
+def write_texts(
+    done: Done, asked: Wanted | None
+) -> tuple[dict[str, str | bytes], list[str]]:
+    """The files by name, and what to warn of."""
+    maps = [corrections(one) for one in done.cameras]
+    done = replace(done, maps=maps)
+    texts: dict[str, str | bytes] = dict(contents(done))
+    warnings = []
+    if asked is not None:
+        of_places, told = corrected_texts(done, asked)
+        texts |= of_places
+        warnings += [told] if told else []
+    try:
+        from ..reports.calibration_plots import pictures
+
+        texts |= pictures(done)
+    except ModuleNotFoundError:
+        warnings.append("no pictures: they need matplotlib: pip install 'jaxro[plots]'")
+    return texts, warnings
+
+
+# -------------------------------------------------------------------------------------
+# the calibration
+
+
+def calibrate(options: Options, task: Task, told: Callable[..., None]) -> Done:
+    """Calibrate every image alone, or all together. Raises TableError."""
+    named = task.named
+    common = {
+        "title": task.title,
+        "unit": options.unit,
+        "sigma_known": task.sigma_known,
+        "named": named,
+        "together": task.together,
+    }
+    if task.together:
+        photos, compared, points = calibrate_several(options, task)
+        done = Done(
+            photos=photos,
+            variants=compared,
+            points=points,
+            chosen=any(len(rows) > 1 for rows in compared.values()),
+            **common,
+        )
+    elif options.distances:
+        one, told_by = calibrate_by_distances(options, task)
+        done = Done(
+            photos=[one], variants={}, chosen=False, distances=told_by, **common
+        )
+    else:
+        photos, compared = [], {}
+        for image, name in enumerate(named.images):
+            one, rows = calibrate_alone(options, task, image)
+            photos.append(one)
+            compared[name] = rows
+            told(image + 1)
+        chosen = any(len(rows) > 1 for rows in compared.values())
+        done = Done(photos=photos, variants=compared, chosen=chosen, **common)
+    check_support(done)
+    return done
+
+
+def calibrate_alone(
+    options: Options, task: Task, image: int
+) -> tuple[Photo, list[Variant]]:
+    """One image by the model that it needs."""
+    rows = task.named.rows_of(image)
+    measured = one_image(task, rows, options.y_down, room=_room(task.named))
+    check_direction(options, task, measured)
+    with say_what("Comparing models ..."):
+        found, compared = calibration.choose(measured, task.models, task.known)
+    sigma = float(np.sqrt(np.mean(task.sigma[rows] ** 2)))
+    return _photo(task, image, found), variants(compared, sigma)
+
+
+def _photo(task: Task, image: int, found: Calibration) -> Photo:
+    named, rows = task.named, task.named.rows_of(image)
+    name = named.images[image]
+    camera = name if not task.together else named.cameras[named.camera[image]]
+    own = rows if task.together else np.arange(len(rows))
+    return photo(name, camera, found, named.names_of(rows), own)
+
+
+def one_image(
+    task: Task, rows: np.ndarray, y_down: bool | None, room: int = 0
+) -> MeasuredImage:
+    """The places of these rows with their object points, and masked ones up to the
+    number `room`."""
+    named = task.named
+    at = named.point[rows]
+    missing = max(room - len(rows), 0)
+    longer = lambda a: np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1))
+    return calibration.image(
+        longer(named.places[rows, 0]),
+        longer(named.places[rows, 1]),
+        longer(named.coordinates[at]),
+        sigma=longer(task.sigma[rows]),
+        point_sigma=longer(named.deviations[at]),
+        mask=np.arange(len(rows) + missing) < len(rows),
+        y_down=y_down,
+    )
+
+
+def _room(named: NamedImages) -> int:
+    """A number of points that is enough for every image."""
+    room = LEAST_ROOM
+    while room < np.max(np.bincount(named.image)):
+        room *= 2
+    return room
+
+
+def calibrate_several(
+    options: Options, task: Task
+) -> tuple[list[Photo], dict[str, list[Variant]], ObjectPoints]:
+    """All images at once."""
+    named = task.named
+    y_down = options.y_down
+    if (solid := _most_solid(task)) is not None:
+        check_direction(options, task, solid)
+        y_down = _y_down(task, solid) if y_down is None else y_down
+    try:
+        measured = calibration.images(
+            *named.places.T,
+            named.image,
+            named.point,
+            named.coordinates,
+            point_sigma=np.where(np.isnan(named.deviations), 0.0, named.deviations),
+            sigma=task.sigma,
+            camera=named.camera,
+            y_down=True if y_down is None else y_down,
+        )
+    except ValueError as error:
+        raise _of_names(error, named) from None
+    model, *others = task.models
+    with say_what("Calibrating all images together ..."):
+        if others:
+            found, compared = calibration.choose_together(measured, task.models)
+            mean = float(np.sqrt(np.mean(task.sigma**2)))
+            tried = {"all images": variants(compared, mean)}
+        else:
+            found, tried = calibration.calibrate_together(measured, model), {}
+    one = Program(of_image_number, {}, COMPILE_FAST)
+    photos = [
+        _photo(task, k, one((found, jnp.asarray(k)))) for k in range(len(named.images))
+    ]
+    fixed = named.deviations == 0
+    points = ObjectPoints(
+        names=named.points,
+        coordinates=np.asarray(found.points),
+        deviations=np.where(fixed, 0.0, found.point_deviations),
+        known=named.known,
+        rays=np.bincount(named.point, minlength=len(named.points)),
+    )
+    return photos, tried, points
+
+
+def of_image_number(data) -> Calibration:
+    """`of_image` of its arguments as one."""
+    return of_image(*data)
+
+
+def _of_names(error: ValueError, named: NamedImages) -> TableError:
+    """What is said of numbers of images, said of their names."""
+    text = str(error).removeprefix("calibration.images: ")
+    name = lambda found: f"image {named.images[int(found[1])]!r}"
+    return TableError(
+        named.file,
+        found=re.sub(r"image (\d+)", name, text),
+        expected="known points in more images, or more points that images share",
+    )
+
+
+def calibrate_by_distances(options: Options, task: Task) -> tuple[Photo, Distances]:
+    """One image by the distances between its points, and by its coordinates, which is
+    where they begin."""
+    measured = one_image(task, task.named.rows_of(0), options.y_down)
+    check_direction(options, task, measured)
+    found: DistanceAdjustment
+    with say_what("Adjusting distances ..."):
+        found = adjust_distances(measured, task.models[0])
+    one = _photo(task, 0, found.coordinates)
+    variances = np.diagonal(np.asarray(found.cofactor))[-found.focal.size :]
+    size = float(found.coordinates.frame.size)
+    return one, Distances(
+        centre=np.asarray(found.centre),
+        centre_deviations=np.asarray(found.centre_deviations),
+        focal=np.asarray(found.focal) * size,
+        focal_deviations=float(found.sigma0) * np.sqrt(variances) * size,
+        sigma0=float(found.sigma0),
+        degrees_of_freedom=found.degrees_of_freedom,
+    )
+
+
+# -------------------------------------------------------------------------------------
+# what is wrong with the input, and seen in its result only
+
+
+def check_direction(options: Options, task: Task, measured: MeasuredImage) -> None:
+    """Raises TableError where points off a plane say that y points the other way."""
+    if options.y_down is None or _is_flat(measured):
+        return
+    told = _y_down(task, measured)
+    if told is None or told == options.y_down:
+        return
+    given, other = ("--y-down", "--y-up")[:: 1 if options.y_down else -1]
+    sigma0 = [
+        float(_plain(task, replace_direction(measured, y_down)).sigma0)
+        for y_down in (options.y_down, told)
+    ]
+    if not sigma0[0] > MIRRORED * sigma0[1]:
+        return
+    raise TableError(
+        given,
+        found=f"an image that is mirrored then (one focal length: sigma0 "
+        f"{sigma0[0]:.3g}, with {other} {sigma0[1]:.3g})",
+        expected=f"{other}, or neither of them: the points tell it",
+    )
+
+
+def _y_down(task: Task, measured: MeasuredImage) -> bool | None:
+    """Whether the points say that y points down; None where they do not tell it."""
+    found = _plain(task, replace_direction(measured, None))
+    return bool(found.frame.handedness > 0) if bool(found.usable) else None
+
+
+def replace_direction(measured: MeasuredImage, y_down: bool | None) -> MeasuredImage:
+    """The image with this direction of y."""
+    hand = 0.0 if y_down is None else 1.0 if y_down else -1.0
+    return MeasuredImage(
+        places=measured.places,
+        points=measured.points,
+        sigma=measured.sigma,
+        point_sigma=measured.point_sigma,
+        mask=measured.mask,
+        handedness=jnp.asarray(hand),
+    )
+
+
+def _plain(task: Task, measured: MeasuredImage) -> Calibration:
+    """The image with one focal length."""
+    one = Model(rays=task.models[0].rays)
+    return calibration.calibrate(measured, one, task.known)
+
+
+def _is_flat(measured: MeasuredImage) -> bool:
+    """Whether the points lie near a plane, which does not tell the direction of y."""
+    points = np.asarray(measured.points)[np.asarray(measured.mask)]
+    spread = np.linalg.svd(points - np.mean(points, axis=0), compute_uv=False)
+    return bool(spread[-1] <= NEARLY_FLAT * np.linalg.norm(spread))
+
+
+def _most_solid(task: Task) -> MeasuredImage | None:
+    """The image with the most known points, if these tell the direction of y."""
+    named = task.named
+    known = named.known[named.point]
+    counts = np.bincount(named.image[known], minlength=len(named.images))
+    image = int(np.argmax(counts))
+    if counts[image] < 2 * SUPPORT:
+        return None
+    rows = np.flatnonzero(known & (named.image == image))
+    measured = one_image(task, rows, None, room=_room(named))
+    return None if _is_flat(measured) else measured
+
+
+def check_support(done: Done) -> None:
+    """Raises TableError where a focal length of a zone has too few points."""
+    for one in done.photos:
+        model: Model = one.found.model
+        if model.focals <= (1 if model.y is None else 2):
+            continue
+        counts: Sequence[int] = one.figures.in_zones.tolist()
+        few = [k for k, count in enumerate(counts) if count < SUPPORT]
+        if few:
+            axis, number = zone_names(model)[few[0]]
+            raise TableError(
+                "--zones-y" if axis == "fy" else "--zones",
+                found=f"{counts[few[0]]} points for {axis} of zone {number} in "
+                f"{one.name!r}",
+                expected=f"at least {SUPPORT} points in each zone; choose fewer zones",
+            )

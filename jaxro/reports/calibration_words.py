@@ -1,0 +1,157 @@
+"""What a calibration says in words: what an image needs, how accurate it is, what to
+do where it failed, and what to mind."""
+
+import numpy as np
+
+from ..adjustment import critical_values as critical
+from ..calibration.results import RESULTS
+from .calibration_model import Done, Photo, describe, lens_names
+from .pair import digits, join_names
+from .reliability import DOUBTFUL
+from .text import number
+
+FEW = 15
+"""Degrees of freedom below which a choice among models is said to rest on little."""
+
+POORLY = 0.1
+"""Redundancy below which a coordinate is said to be poorly checked."""
+
+OPTIONS = {
+    "plane_object": "Options: --principal-point X Y --principal-sigma S, or --focal F "
+    "--focal-sigma S.",
+    "weakly_determined": "Options: --model one-f, or --principal-point X Y "
+    "--principal-sigma S.",
+    "diverged": "Try --y-up or --y-down, --model one-f, and look for exchanged points.",
+}
+"""What on the command line helps where a calibration failed."""
+
+
+def advice(one: Photo) -> str:
+    """What to do about an image that failed."""
+    return f"{RESULTS[one.found.result]} {OPTIONS.get(one.result, '')}".rstrip()
+
+
+def decision(done: Done, one: Photo) -> str:
+    """What the image needs, in words."""
+    model, figures = one.found.model, one.figures
+    what = "These images" if done.together else "This image"
+    if model.field is not None:
+        lens = "" if model.brown is None else " beside Brown's lens"
+        need = "needs" if not done.together else "need"
+        verb = need if done.chosen else "got"
+        text = (
+            f"{what} {verb} a displacement field{lens}: "
+            f"{number(figures.in_field, 1)} effective parameters"
+        )
+        if not done.together:
+            error = one.expected_error
+            text += (
+                f", expected error of a corrected place {number(error, digits(error))} "
+                f"{done.unit}"
+            )
+        return f"{text}."
+    name = _name_of(one)
+    if not done.chosen:
+        return f"{name[0].upper()}{name[1:]}, as asked."
+    return f"{name[0].upper()}{name[1:]} {'are' if 'lengths' in name else 'is'} enough."
+
+
+def _name_of(one: Photo) -> str:
+    model = one.found.model
+    if model.brown is not None:
+        zones = "" if model.focals == 1 else f" with {describe(model).split(' + ')[0]}"
+        return f"Brown's lens ({', '.join(lens_names(model))}){zones}"
+    if model.focals == 1:
+        return "one focal length"
+    if describe(model) == "fx, fy":
+        return "two focal lengths"
+    return f"focal lengths by zones ({describe(model)})"
+
+
+def accuracy(done: Done, one: Photo) -> str:
+    """sigma0 with its unit, and its test where sigma was given."""
+    sigma0, freedom = float(one.figures.sigma0), int(one.figures.degrees_of_freedom)
+    plural = "s" * (freedom != 1)
+    value = number(sigma0, digits(sigma0, 2))
+    unit = "" if done.sigma_known else f" {done.unit}"
+    text = f"sigma0 {value}{unit}, {freedom} degree{plural} of freedom"
+    if done.sigma_known and freedom > 0:
+        text += f", probability beside 1: {chance(sigma0, freedom):.2g}"
+    return text
+
+
+def chance(sigma0: float, freedom: int) -> float:
+    return float(critical.global_p(freedom * sigma0**2, freedom))
+
+
+# -------------------------------------------------------------------------------------
+# what to mind
+
+
+def sentences(done: Done) -> list[str]:
+    """What a careful user should know of the result."""
+    said = []
+    usable = [one for one in done.photos if one.usable]
+    for one in usable if not done.together else usable[:1]:
+        said += [_of(done, one) + text for text in _of_fit(done, one)]
+    for one in usable:
+        said += [_of(done, one, True) + text for text in _of_points(done, one)]
+    if done.named.has_deviations and not done.sigma_known:
+        said.append(
+            "The object points have standard deviations and the places have none: they "
+            f"are taken to be 1 {done.unit}. Give --sigma."
+        )
+    return said
+
+
+def _of(done: Done, one: Photo, always: bool = False) -> str:
+    several = len(done.photos) > 1 and (always or not done.together)
+    return f"{one.name}: " if several else ""
+
+
+def _of_fit(done: Done, one: Photo) -> list[str]:
+    sigma0, freedom = float(one.figures.sigma0), int(one.figures.degrees_of_freedom)
+    said = []
+    if done.sigma_known and freedom > 0 and chance(sigma0, freedom) < DOUBTFUL:
+        probability = chance(sigma0, freedom)
+        if sigma0 > 1:
+            said.append(
+                f"The coordinates are {sigma0:.1f} times less accurate than their sigma "
+                f"says (probability {probability:.1g}): sigma is too small, points are "
+                "wrong, or the image needs another model."
+            )
+        else:
+            said.append(
+                f"The coordinates are {1 / sigma0:.1f} times more accurate than their "
+                f"sigma says (probability {probability:.1g}): sigma is too large."
+            )
+    if freedom < FEW:
+        said.append(
+            f"{freedom} degree{'s' * (freedom != 1)} of freedom: few points for a "
+            "choice among models. Measure more points."
+        )
+    return said
+
+
+def _of_points(done: Done, one: Photo) -> list[str]:
+    said = []
+    sizes = np.max(np.abs(done.w(one)), axis=1)
+    limit, k = done.limit(one), int(np.argmax(sizes))
+    if sizes[k] > limit:
+        w, others = "w" if done.sigma_known else "tau", int(np.sum(sizes > limit)) - 1
+        also = f" ({others} more exceed the limit)" if others else ""
+        said.append(
+            f"Point {one.names[k]} has |{w}| = {sizes[k]:.1f} where {limit:.1f} is "
+            f"allowed{also}: it is wrong in the image or in the object, or the model "
+            "is not enough."
+        )
+    if not np.all(one.ahead):
+        behind = [one.names[k] for k in np.flatnonzero(~one.ahead)]
+        said.append(f"Behind the camera: {join_names(behind, 10)}.")
+    poorly = np.min(one.redundancy, axis=1) < POORLY
+    if np.any(poorly) and not done.together:
+        names = [one.names[k] for k in np.flatnonzero(poorly)]
+        said.append(
+            f"Poorly checked (redundancy below {POORLY}): {join_names(names, 10)}."
+        )
+    return said
