@@ -277,6 +277,25 @@ def global_p(squares: Given, freedom: Given) -> Scalar:
     return xp.where(below < above, 2 * below, 2 * above)
 
 
+def fisher_p(f: Given, above: Given, below: Given) -> Scalar:
+    """The probability that F with `above` degrees of freedom of the numerator and
+    `below` of the denominator is larger than `f`; NaN where one of them is not
+    positive."""
+    xp, special, f, a, b = _numbers(f, above, below)
+    there = (a > 0) & (b > 0) & (f >= 0)
+    a, b, f = (xp.where(there, value, 1.0) for value in (a, b, f))
+    return xp.where(there, special.betainc(b / 2, a / 2, b / (b + a * f)), xp.nan)
+
+
+def chi_squared_p(squares: Given, freedom: Given) -> Scalar:
+    """The probability that a sum of `freedom` squared normal numbers is larger than
+    `squares`; NaN without a degree of freedom."""
+    xp, special, x, f = _numbers(squares, freedom)
+    there = (f > 0) & (x >= 0)
+    x, f = xp.where(there, x, 1.0), xp.where(there, f, 1.0)
+    return xp.where(there, special.gammaincc(f / 2, x / 2), xp.nan)
+
+
 def by_count(
     value: Callable[[np.ndarray], Scalar], most: int, count: Float[Array, ""]
 ) -> Float[Array, ""]:

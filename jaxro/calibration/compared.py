@@ -1,19 +1,17 @@
 """Two calibrations in one measuring system: the rays that both give to the same places,
 the pose between them, and how the rays follow the measurements."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..adjustment import symmetric
-from .camera import Measured, corrected, scale
+from .camera import Measured
+from .correct import ideal
 from .field import functions
 from .images import Places
-from .models import field_weights, parameter_weights
 from .result import Calibration
 from .slopes import inverse_of_two, slopes
 
@@ -91,20 +89,10 @@ def _ideal(
     """The corrected places for a focal length in the unit of the image, and their
     derivatives by all parameters of the calibration; the station has no part in them.
     """
-    u = found.frame.normal_places(nodes)
-    weights = parameter_weights(found.model, u, found.area, found.basis)
-    field = field_weights(found.model, u, found.area)
-    measured = Measured(u, jnp.zeros((len(u), 3)), weights, field)
-    values, camera_of = ravel_pytree(found.camera)
-
-    def ideal(values: Array, one: Measured) -> Array:
-        camera = camera_of(values)
-        return focal * corrected(camera, one) / scale(camera, one)
-
-    places = jax.vmap(partial(ideal, values))(measured)
-    by_camera = jax.vmap(partial(jax.jacfwd(ideal), values))(measured)
-    rows = by_camera.reshape(-1, values.size)
-    return places, jnp.pad(rows, ((0, 0), (6, 0)))
+    places, slopes = ideal(found, found.frame.normal_places(nodes))
+    larger = focal / jnp.mean(found.basis @ found.camera.focal)
+    rows = larger * slopes.reshape(-1, slopes.shape[2])
+    return larger * places, jnp.pad(rows, ((0, 0), (6, 0)))
 
 
 def _nearer(posed, pose: Array, places: Places, aim: Places) -> Array:

@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
+from ..adjustment import critical_values
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .compared import Compared, compare_rays, prior_deviation
-from .probabilities import fisher_p
 from .result import Calibration
 
 NODES = 15
@@ -109,7 +109,7 @@ def difference(
         f=f,
         above=rank,
         below=below,
-        probability=float(fisher_p(f, rank, below)),
+        probability=float(critical_values.fisher_p(f, rank, below)),
     )
 
 

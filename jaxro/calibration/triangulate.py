@@ -30,7 +30,6 @@ from ..xla.settings import COMPILE_FAST
 from .camera import Camera, Measured, Rays, Station, corrected, scale
 from .images import Frame, Points
 from .models import field_weights, parameter_weights
-from .probabilities import chi_squared_p
 from .result import Calibration
 from .slopes import inverse_of_two, slopes_of_one
 
@@ -266,7 +265,7 @@ def _intersect(
         covariances=kept(inverse.matrix),
         squares=kept(squares),
         degrees_of_freedom=spare,
-        probability=kept(chi_squared_p(squares, spare)),
+        probability=kept(critical_values.chi_squared_p(squares, spare)),
         angle=angle,
         freedom=jnp.sum(jnp.where(use, freedom, 0.0)),
         result=result,

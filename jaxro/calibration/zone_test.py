@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..adjustment import critical_values
 from ..xla.programs import is_traced
 from .calibrate import calibrate
 from .images import MeasuredImage
 from .known import NOTHING, Known
 from .models import Model
-from .probabilities import fisher_p
 from .result import Calibration
 from .zones import Whole
 
@@ -81,7 +81,7 @@ def test_zones(
         f=f,
         above=above,
         below=below,
-        probability=fisher_p(f, above, below),
+        probability=critical_values.fisher_p(f, above, below),
         usable=usable,
         with_zones=with_zones,
         merged=merged,

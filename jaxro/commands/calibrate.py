@@ -27,6 +27,7 @@ from ..reports.calibration_model import (
 )
 from ..reports.terminal import consoles, progress, say_compiling, say_what
 from ..tables import whole
+from ..tables.examples import calibration as example
 from ..tables.fields import TableError
 from ..tables.images import NamedImages
 from ..xla import programs
@@ -107,7 +108,7 @@ def calibrate(options: Options, task: Task, told: Callable[..., None]) -> Done:
     named = task.named
     common = {
         "title": task.title,
-        "unit": options.unit,
+        "unit": options.unit if options.file is not None else example.UNIT,
         "sigma_known": task.sigma_known,
         "named": named,
         "together": task.together,

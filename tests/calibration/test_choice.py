@@ -2,28 +2,13 @@
 
 import numpy as np
 import pytest
+from deformed_film import film
 from oracles_calibration import scene
 
 from jaxro import calibration
 from jaxro.calibration import Brown, Field, Model
 
 SIGMA = 0.006
-
-
-def film(rng, places, most=0.9, half=30.0):
-    """Another smooth deformation of the film for every image, unsymmetric: polynomials
-    of the fourth degree."""
-    powers = [(i, j) for i in range(5) for j in range(5) if 0 < i + j <= 4]
-    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 21)] * 2), -1).reshape(-1, 2)
-    legendre = lambda t, k: np.polynomial.legendre.Legendre.basis(k)(t)
-    coefficients = rng.normal(size=(2, len(powers)))
-    coefficients /= np.array([(i + j) ** 1.5 for i, j in powers])
-
-    def moved(t):
-        basis = [legendre(t[:, 0], i) * legendre(t[:, 1], j) for i, j in powers]
-        return (coefficients @ np.array(basis)).T
-
-    return moved(places / half) * most / np.hypot(*moved(grid).T).max()
 
 
 def images(seed, n, distort):

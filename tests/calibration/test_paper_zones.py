@@ -70,8 +70,8 @@ def test_constant_zones_gain_little(n):
 
 @pytest.mark.slow
 def test_what_the_papers_choice_loses():
-    """Against the choice by evidence among models with fields, and among the same
-    zones: medians of ten images."""
+    """Against the choice by evidence among models with fields: medians of ten images.
+    What is lost is lost by constant zones: evidence takes none that is much better."""
     fields = [Model(field=Field(0.8, strength)) for strength in (10.0, 30.0, 100.0)]
     losses = []
     for seed in range(10):
@@ -91,4 +91,4 @@ def test_what_the_papers_choice_loses():
         losses.append(np.array(wrong[:-1]) / wrong[-1])
     *rules, by_score = np.median(losses, axis=0)
     assert np.all(np.array(rules) > 2)
-    assert np.all(np.array(rules) > 0.9 * by_score)
+    assert by_score > 2

@@ -9,8 +9,8 @@ from oracles_calibration import gauss_newton, rays, scene
 from scipy import stats
 
 from jaxro import calibration
+from jaxro.adjustment.critical_values import chi_squared_p, fisher_p
 from jaxro.calibration import Model, Whole, rectangles, strips_along_x, zone_test
-from jaxro.calibration.probabilities import chi_squared_p, fisher_p
 
 SIGMA = 0.006
 AT = np.array([110.0, 70.0])

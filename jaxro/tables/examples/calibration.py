@@ -6,6 +6,7 @@ normal errors of 0.006 mm in every coordinate. STATION: where the camera stood.
 """
 
 NAME = "simulated photo"
+UNIT = "mm"
 STATION = (103.0, 98.0, 13.2)
 IMAGE = """\
 point,x,y
