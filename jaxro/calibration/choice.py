@@ -11,8 +11,8 @@ each coordinate in turn (`left_out`).
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -122,13 +122,24 @@ def choose(
 def _compare(
     data: tuple[MeasuredImage, Known, Start], models: tuple[Model, ...]
 ) -> Figures:
+    number = 2 * count(data[0].mask)
+    read = lambda found, padded, sigma: assess(found, padded, sigma, number)
+    return adjust_models(data, models, read)
+
+
+def adjust_models(
+    data: tuple[MeasuredImage, Known, Start],
+    models: tuple[Model, ...],
+    read: Callable[[JointAdjustment, Padded, Float[Array, ""]], Any],
+) -> Any:
+    """What `read` takes from the adjustment of one image by each model and from the
+    standard deviation of a place in the units of the frame."""
     measured, known, first = data
     given = frame(measured, first.handedness)
     observed = observe(measured, given)
-    area = Area(observed.places, measured.mask, given.half_sides, first.principal)
     common = Common(
         places=observed.places,
-        area=area,
+        area=Area(observed.places, measured.mask, given.half_sides, first.principal),
         known=known,
         frame=given,
         sigma=observed.sigma,
@@ -136,16 +147,10 @@ def _compare(
         principal=first.principal,
     )
 
-    def adjust(padded: Padded) -> Figures:
-        found = solve(
-            observed,
-            padded.focal,
-            padded.field,
-            padded.prior,
-            models[0].rays,
-            (first.station, padded.camera),
-        )
-        return assess(found, padded, observed.sigma, 2 * count(observed.mask))
+    def adjust(one: Padded) -> Any:
+        start, rays = (first.station, one.camera), models[0].rays
+        found = solve(observed, one.focal, one.field, one.prior, rays, start)
+        return read(found, one, observed.sigma)
 
     every = jax.tree.map(lambda *a: jnp.stack(a), *pad(models, common))
     return jax.vmap(adjust)(every)

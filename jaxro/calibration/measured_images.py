@@ -79,7 +79,13 @@ def images(
             f"(points like it: {np.sum(lonely)})"
         )
     number = int(image.max()) + 1
-    _check_connection(image, point, known, number)
+    few, seen = find_unreached(image, point, known, number)
+    if few.size:
+        raise ValueError(
+            f"calibration.images: an image needs {FEWEST} points that are known or seen "
+            f"in two images with as many; image {few[0]} has {seen[0]} (images like it: "
+            f"{few.size})"
+        )
     return MeasuredImages(
         places=jnp.asarray(places),
         image=jnp.asarray(image),
@@ -106,19 +112,15 @@ def _rows(image: np.ndarray, number: int) -> np.ndarray:
     return rows
 
 
-def _check_connection(
+def find_unreached(
     image: np.ndarray, point: np.ndarray, known: np.ndarray, number: int
-) -> None:
-    """Raises ValueError if resection and intersection in turns leave an image out."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """The images that resection and intersection in turns leave out, and how many
+    points each of them has; `number`: of all images."""
     seen = np.bincount(image[known[point]], minlength=number)
     for _ in range(TURNS):
         rays = np.bincount(point[(seen >= FEWEST)[image]], minlength=len(known))
         known = known | (rays >= 2)
         seen = np.bincount(image[known[point]], minlength=number)
     few = np.flatnonzero(seen < FEWEST)
-    if few.size:
-        raise ValueError(
-            f"calibration.images: an image needs {FEWEST} points that are known or seen "
-            f"in two images with as many; image {few[0]} has {seen[few[0]]} (images like "
-            f"it: {len(few)})"
-        )
+    return few, seen[few]

@@ -22,27 +22,24 @@ from collections.abc import Sequence
 from itertools import product
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..adjustment import RESULTS, critical_values
+from ..adjustment import RESULTS, JointAdjustment, critical_values
 from ..adjustment.guarded import times
 from ..xla.passes import count
 from ..xla.programs import Program
 from ..xla.settings import MOMENT, settings_for
-from .calibrate import first_start, observe
-from .choice import Figures, assess
+from .calibrate import first_start
+from .choice import Figures, adjust_models, assess
 from .images import MeasuredImage, frame
 from .known import NOTHING, Known
 from .models import Model
-from .padded import Common, Padded, pad
-from .problem import solve
+from .padded import Padded
 from .starts import Start
 from .zones import (
     AbstractZones,
-    Area,
     Whole,
     rectangles,
     rings,
@@ -262,30 +259,17 @@ def _adjust_all(
 ) -> tuple[Float[Array, "model p p"], Bool[Array, " model"], Figures]:
     """Of every model the covariance of all parameters in the units of object and image,
     whether it can be used, and its figures."""
-    measured, known, first = data
+    measured, _, first = data
     given = frame(measured, first.handedness)
-    observed = observe(measured, given)
-    common = Common(
-        places=observed.places,
-        area=Area(observed.places, measured.mask, given.half_sides, first.principal),
-        known=known,
-        frame=given,
-        sigma=observed.sigma,
-        focal=first.focal,
-        principal=first.principal,
-    )
+    number = 2 * count(measured.mask)
 
-    def adjust(one: Padded) -> tuple[Array, Array, Figures]:
-        start = first.station, one.camera
-        rays = models[0].rays
-        found = solve(observed, one.focal, one.field, one.prior, rays, start)
+    def read(found: JointAdjustment, padded: Padded, sigma: Array):
         settled = found.result == RESULTS.successful
         covariance = times(found.cofactor, found.sigma0**2)
-        figures = assess(found, one, observed.sigma, 2 * count(observed.mask))
+        figures = assess(found, padded, sigma, number)
         return covariance, settled & (found.degrees_of_freedom > 0), figures
 
-    every = jax.tree.map(lambda *a: jnp.stack(a), *pad(models, common))
-    covariances, usable, figures = jax.vmap(adjust)(every)
+    covariances, usable, figures = adjust_models(data, models, read)
     camera = covariances.shape[1] - 6
     units = jnp.concatenate(
         [

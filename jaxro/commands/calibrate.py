@@ -1,6 +1,5 @@
 """One call of `jaxro calibrate` from its options to its report and files."""
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -10,6 +9,7 @@ import numpy as np
 from .. import calibration
 from ..calibration import Calibration, MeasuredImage, Model
 from ..calibration.distances import DistanceAdjustment, adjust_distances
+from ..calibration.measured_images import FEWEST, find_unreached
 from ..calibration.of_image import of_image
 from ..calibration.starts import NEARLY_FLAT
 from ..reports import calibration as report
@@ -198,19 +198,17 @@ def calibrate_several(
     if (solid := _most_solid(task)) is not None:
         check_direction(options, task, solid)
         y_down = _y_down(task, solid) if y_down is None else y_down
-    try:
-        measured = calibration.images(
-            *named.places.T,
-            named.image,
-            named.point,
-            named.coordinates,
-            point_sigma=np.where(np.isnan(named.deviations), 0.0, named.deviations),
-            sigma=task.sigma,
-            camera=named.camera,
-            y_down=True if y_down is None else y_down,
-        )
-    except ValueError as error:
-        raise _of_names(error, named) from None
+    check_reached(named)
+    measured = calibration.images(
+        *named.places.T,
+        named.image,
+        named.point,
+        named.coordinates,
+        point_sigma=np.where(np.isnan(named.deviations), 0.0, named.deviations),
+        sigma=task.sigma,
+        camera=named.camera,
+        y_down=True if y_down is None else y_down,
+    )
     model, *others = task.models
     with say_what("Calibrating all images together ..."):
         if others:
@@ -239,15 +237,18 @@ def of_image_number(data) -> Calibration:
     return of_image(*data)
 
 
-def _of_names(error: ValueError, named: NamedImages) -> TableError:
-    """What is said of numbers of images, said of their names."""
-    text = str(error).removeprefix("calibration.images: ")
-    name = lambda found: f"image {named.images[int(found[1])]!r}"
-    return TableError(
-        named.file,
-        found=re.sub(r"image (\d+)", name, text),
-        expected="known points in more images, or more points that images share",
-    )
+def check_reached(named: NamedImages) -> None:
+    """Raises TableError for images that nothing joins to the known points."""
+    few, seen = find_unreached(named.image, named.point, named.known, len(named.images))
+    if few.size:
+        raise TableError(
+            named.file,
+            found=f"too few points: image {named.images[few[0]]!r} has {seen[0]} that "
+            f"are known or seen in two images with {FEWEST} of them (images like it: "
+            f"{few.size})",
+            expected=f"at least {FEWEST}: known points in more images, or more points "
+            "that images share",
+        )
 
 
 def calibrate_by_distances(options: Options, task: Task) -> tuple[Photo, Distances]:
@@ -306,14 +307,7 @@ def _y_down(task: Task, measured: MeasuredImage) -> bool | None:
 def replace_direction(measured: MeasuredImage, y_down: bool | None) -> MeasuredImage:
     """The image with this direction of y."""
     hand = 0.0 if y_down is None else 1.0 if y_down else -1.0
-    return MeasuredImage(
-        places=measured.places,
-        points=measured.points,
-        sigma=measured.sigma,
-        point_sigma=measured.point_sigma,
-        mask=measured.mask,
-        handedness=jnp.asarray(hand),
-    )
+    return replace(measured, handedness=jnp.asarray(hand))
 
 
 def _plain(task: Task, measured: MeasuredImage) -> Calibration:

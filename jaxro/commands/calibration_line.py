@@ -30,7 +30,7 @@ ObjectPoints = Annotated[
         show_default=False,
     ),
 ]
-Wanted = Annotated[
+ModelName = Annotated[
     str | None,
     typer.Option(
         "--model",
@@ -169,7 +169,7 @@ Out = Annotated[
 def calibrate(
     file: Places = None,
     object_points: ObjectPoints = None,
-    model: Wanted = None,
+    model: ModelName = None,
     zones: Zones = None,
     zones_y: ZonesAlongY = None,
     fisheye: Fisheye = False,

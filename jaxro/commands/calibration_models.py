@@ -41,7 +41,7 @@ ZONES = (
 Borders = int | list[float]
 
 
-def wanted(
+def select_models(
     model: str | None,
     zones: str | None,
     zones_y: str | None,

@@ -12,7 +12,7 @@ from ..tables import images as tables
 from ..tables.examples import calibration as example
 from ..tables.fields import TableError
 from ..tables.images import NamedImages
-from .calibration_models import wanted
+from .calibration_models import select_models
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def prepare(options: Options) -> Task:
         named = replace(
             named, cameras=named.images, camera=np.arange(len(named.images))
         )
-    models = wanted(
+    models = select_models(
         options.model,
         options.zones,
         options.zones_y,

@@ -203,7 +203,9 @@ class Photo:
         it does not know, sigma0 sigma √((1 - r)/r): its median over the points, in the
         unit of the image."""
         r = np.clip(self.redundancy, 1e-3, 1.0)
-        sigma = np.sqrt(np.mean(np.asarray(self.found.measured.sigma)[: len(r)] ** 2))
+        measured = self.found.measured
+        own = np.asarray(measured.sigma)[np.asarray(measured.mask)]
+        sigma = np.sqrt(np.mean(own**2))
         median = np.sqrt(np.median((1 - r) / r))
         return float(median * sigma * self.figures.sigma0)
 

@@ -14,7 +14,7 @@ from jaxro.calibration import (
     strips_along_x,
     strips_along_y,
 )
-from jaxro.commands.calibration_models import MODELS, parse_zones, wanted
+from jaxro.commands.calibration_models import MODELS, parse_zones, select_models
 from jaxro.tables.fields import TableError
 
 
@@ -42,7 +42,7 @@ def test_other_texts_are_no_zones(text):
 
 
 def options(model=None, zones=None, zones_y=None, fisheye=False, together=False):
-    return wanted(model, zones, zones_y, fisheye=fisheye, together=together)
+    return select_models(model, zones, zones_y, fisheye=fisheye, together=together)
 
 
 def test_every_name_stands_for_models():
