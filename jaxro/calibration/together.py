@@ -22,7 +22,7 @@ from .images import Frame
 from .known import NOTHING, prior
 from .measured_images import MeasuredImages
 from .models import Model, field_weights, focal_weights
-from .problem_together import approximate, solve_together
+from .problem_together import Approximate, approximate, solve_together
 from .results import RESULTS, is_usable
 from .verdict import verdict_of_several
 from .zones import Area
@@ -145,12 +145,16 @@ def calibrate_together(
             "calibrate_together: focal lengths that change linearly imitate tilts; take "
             "a field, or zones of degree 0"
         )
+    # where the adjustment begins is a program of its own, which all models share
+    begin = Program(approximate, {"rays": model.rays}, COMPILE_FAST)(measured)
     static = {"model": model, "free_network": free_network}
-    return Program(_adjust, static, COMPILE_FAST)(measured)
+    return Program(_adjust, static, COMPILE_FAST)((measured, begin))
 
 
-def _adjust(measured: MeasuredImages, model: Model, free_network: bool) -> Together:
-    begin = approximate(measured, model.rays)
+def _adjust(
+    data: tuple[MeasuredImages, Approximate], model: Model, free_network: bool
+) -> Together:
+    measured, begin = data
     u, area = begin.places, begin.area
     focal, field = focal_weights(model, u, area), field_weights(model, u, area)
     number, zones = measured.cameras, focal.shape[2]

@@ -397,3 +397,30 @@ def test_independent_distances_claim_too_much(n, most):
         found = adjust_distances(image, independent=True)
         held.append(np.abs(found.centre - truth[3:]) < 1.96 * found.centre_deviations)
     assert np.mean(held) < most
+
+
+@pytest.mark.slow
+def test_a_stretched_film_is_measured_at_any_swing():
+    """One axis of the film is longer by 1 %: fx / fy tells it within three standard
+    deviations, and sigma0 is that of the measurements."""
+    images = []
+    for swing in np.linspace(0, 2 * np.pi, 24, endpoint=False):
+        rng = np.random.default_rng(len(images))
+        points = rng.uniform([-4, -4, -2], [4, 4, 2], (40, 3))
+        angles = np.array([0.2, -0.15, swing])
+        station = rotation(*angles).T @ np.array([0.0, 0.0, 12.0])
+        places = 60 * rays(np.array([*angles, *station]), points) * [1.01, 1.0]
+        places = places + rng.normal(0, SIGMA, places.shape)
+        images.append(calibration.image(*places.T, points, sigma=SIGMA, y_down=True))
+
+    def stretch(image):
+        found = calibration.calibrate(image, Model(y=Whole()))
+        x, y = found.focal
+        slopes = jnp.stack([1 / y, -x / y**2])
+        covariance = found.covariance[8:10, 8:10] * found.frame.size**2
+        return found.sigma0, x / y, jnp.sqrt(slopes @ covariance @ slopes)
+
+    stacked = jax.tree.map(lambda *a: jnp.stack(a), *images)
+    sigma0, ratio, deviation = map(np.asarray, jax.jit(jax.vmap(stretch))(stacked))
+    assert 0.9 < np.sqrt(np.mean(sigma0**2)) < 1.1
+    assert np.all(np.abs(ratio - 1.01) < 3 * deviation)
