@@ -13,14 +13,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .parameters import as_given, as_parameters
+from .propagation import jacobian
 from .terms import Term, close, discrepancy, whiten
 
 Families = Mapping[str, Any]
 """Parameters by the name of their family: `AbstractParameters` or trees of numbers,
 members on the first axis."""
 
-Steps = dict[str, Float[Array, "member d"]]
-"""A displacement of every member of every family."""
+Steps = dict[str, Float[Array, "_ _"]]
+"""A displacement of every member of every family, (member, d)."""
 
 
 class Linearised(eqx.Module):
@@ -74,7 +75,7 @@ def linearise(term: Term, families: Families, steps: Steps) -> Linearised:
 
     def group(observation, cofactor, use, blocks, local):
         of = lambda local: one(observation, cofactor, use, blocks, local)
-        return of(local), jax.jacfwd(of)(local)
+        return of(local), jacobian(of, local)
 
     return Linearised(*jax.vmap(group)(*_parts(term, families, steps)))
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from ..adjustment import RESULTS, JointAdjustment, symmetric
 from ..xla.passes import count
 from ..xla.programs import Program
-from ..xla.settings import MOMENT, settings_for
+from ..xla.settings import COMPILE_FAST, MOMENT, settings_for
 from .brown import Brown
 from .calibrate import calibrate, first_start, observe
 from .camera import Rays, perspective
@@ -104,7 +104,7 @@ def compare(
         raise ValueError("compare: all models have the same rays")
     settings = settings_for(measured.mask.size, MOMENT)
     first = Program(first_start, {"rays": rays}, settings)((measured, known))
-    program = Program(_compare, {"models": models}, settings)
+    program = Program(_compare, {"models": models}, COMPILE_FAST)
     return Comparison(models, program((measured, known, first)))
 
 
@@ -153,7 +153,8 @@ def adjust_models(
         return read(found, one, observed.sigma)
 
     every = jax.tree.map(lambda *a: jnp.stack(a), *pad(models, common))
-    return jax.vmap(adjust)(every)
+    # one after the other: together they would all wait for the slowest
+    return jax.lax.map(adjust, every)
 
 
 def assess(

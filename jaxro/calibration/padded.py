@@ -58,17 +58,24 @@ class Common(eqx.Module):
 def pad(models: Sequence[Model], common: Common) -> list[Padded]:
     """Every model with as many parameters as the largest of them."""
     size = size_of(models)
-    # fields that differ in their strength alone have the same columns
-    columns: dict = {}
+    # many models share their zones, and fields that differ in their strength alone have
+    # the same columns
+    zones, columns = {}, {}
     for model in models:
-        if (key := _columns_of(model)) not in columns:
-            columns[key] = _columns(model, size, common)
-    return [_pad(m, size, columns[_columns_of(m)], common) for m in models]
+        if (own := _zones_of(model)) not in zones:
+            zones[own] = _focals(model, common)
+        if (own := _columns_of(model)) not in columns:
+            columns[own] = _columns(model, size, common)
+    return [
+        _pad(m, size, zones[_zones_of(m)], columns[_columns_of(m)], common)
+        for m in models
+    ]
 
 
 def pad_one(model: Model, size: Size, common: Common) -> Padded:
     """One model with as many parameters as `size` says."""
-    return _pad(model, size, _columns(model, size, common), common)
+    focals, columns = _focals(model, common), _columns(model, size, common)
+    return _pad(model, size, focals, columns, common)
 
 
 def size_of(models: Sequence[Model]) -> Size:
@@ -76,6 +83,25 @@ def size_of(models: Sequence[Model]) -> Size:
     fields = any(model.field is not None for model in models)
     focals = max(model.focals - model.imitated for model in models)
     return Size(focals, 2 * MODES if fields else 0)
+
+
+class _Focals(NamedTuple):
+    """The focal lengths of a model: their weights at the places, and of which
+    parameters they are made (`imitating`)."""
+
+    weights: Float[Array, "point 2 parameter"]
+    basis: Float[Array, "zone parameter"]
+
+
+def _zones_of(model: Model) -> tuple:
+    """What the focal lengths of a model depend on."""
+    return model.x, model.y
+
+
+def _focals(model: Model, common: Common) -> _Focals:
+    basis = imitating(model, common.area)
+    weights = parameter_weights(model, common.places, common.area, basis)
+    return _Focals(weights, basis)
 
 
 def _columns_of(model: Model) -> tuple | None:
@@ -89,9 +115,10 @@ def _columns(model: Model, size: Size, common: Common) -> Array:
     return field_weights(model, common.places, common.area)
 
 
-def _pad(model: Model, size: Size, field: Array, common: Common) -> Padded:
-    basis = imitating(model, common.area)
-    focal = parameter_weights(model, common.places, common.area, basis)
+def _pad(
+    model: Model, size: Size, focals: _Focals, field: Array, common: Common
+) -> Padded:
+    focal, basis = focals
     camera = Camera(
         principal=common.principal,
         focal=common.focal * jnp.sum(basis, axis=0),
