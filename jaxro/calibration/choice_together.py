@@ -31,7 +31,7 @@ from .brown import Brown
 from .camera import Camera
 from .choice import Comparison, Figures, assess, evidence, fields_of, plain_models
 from .field import Field
-from .known import NOTHING
+from .known import NOTHING, Known
 from .measured_images import MeasuredImages
 from .models import Model
 from .padded import Common, Padded, pad_one, size_of
@@ -69,7 +69,9 @@ def models_of_cameras() -> tuple[Model, ...]:
 
 
 def choose_together(
-    measured: MeasuredImages, models: Sequence[Model] | None = None
+    measured: MeasuredImages,
+    models: Sequence[Model] | None = None,
+    known: Known = NOTHING,
 ) -> tuple[Together, Comparison]:
     """The calibration of several images by the model with the greatest evidence, and
     the comparison that it comes from.
@@ -78,12 +80,14 @@ def choose_together(
     search begins. All models share their rays, and have no zones of focal lengths that
     change linearly.
     """
-    compared = compare_together(measured, models)
-    return calibrate_together(measured, compared.best), compared
+    compared = compare_together(measured, models, known)
+    return calibrate_together(measured, compared.best, known), compared
 
 
 def compare_together(
-    measured: MeasuredImages, models: Sequence[Model] | None = None
+    measured: MeasuredImages,
+    models: Sequence[Model] | None = None,
+    known: Known = NOTHING,
 ) -> Comparison:
     """The adjustment of several images by every model, with the strength that has the
     greatest evidence."""
@@ -101,7 +105,8 @@ def compare_together(
     for k, model in enumerate(models):
         strength = 1.0 if model.field is None else float(model.field.strength)
         for _ in range(ROUNDS):
-            tried = program((measured, begin, jnp.asarray(k), jnp.asarray(strength)))
+            at = jnp.asarray(k), jnp.asarray(strength)
+            tried = program((measured, known, begin, *at))
             if np.isfinite(tried.figures.score):
                 begin = tried.solution
             best = STRENGTHS[int(np.nanargmin(tried.scores))]
@@ -120,15 +125,15 @@ def _with_strength(model: Model, strength: Float[Array, ""] | float) -> Model:
 
 
 def adjust_model(
-    data: tuple[MeasuredImages, Approximate, Int[Array, ""], Float[Array, ""]],
+    data: tuple[MeasuredImages, Known, Approximate, Int[Array, ""], Float[Array, ""]],
     models: tuple[Model, ...],
 ) -> Tried:
     """The adjustment by model number k, its field of the strength given."""
-    measured, begin, k, strength = data
+    measured, known, begin, k, strength = data
     common = Common(
         places=begin.places,
         area=begin.area,
-        known=NOTHING,
+        known=known,
         frame=begin.frame,
         sigma=begin.sigma,
         focal=jnp.ones(()),
@@ -167,9 +172,15 @@ def adjust_model(
         begin,
         (found.parameters["station"], cameras, found.parameters["point"]),
     )
+    with_field = jnp.array([model.field is not None for model in models])[k]
+    scores = jax.lax.cond(
+        with_field,
+        lambda: _scores(found, padded, begin.sigma, number),
+        lambda: jnp.zeros(len(STRENGTHS)),
+    )
     return Tried(
         figures=assess(found, padded, begin.sigma, number),
-        scores=_scores(found, padded, begin.sigma, number),
+        scores=scores,
         solution=solution,
     )
 

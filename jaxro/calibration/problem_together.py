@@ -56,7 +56,7 @@ def solve_together(
     begin: Approximate,
     focal: Float[Array, "place 2 zone"],
     field: Float[Array, "place 2 mode"],
-    known: Prior,
+    beforehand: Prior,
     rays: Rays,
     families: dict[str, Any],
     free_network: bool = False,
@@ -77,7 +77,7 @@ def solve_together(
             ("point", measured.point),
         ],
     )
-    terms = [of_places, prior_term(known, measured.cameras)]
+    terms = [of_places, prior_term(beforehand, measured.cameras)]
     if not free_network:
         terms.insert(1, _known_points(measured, begin.frame))
     return adjust(

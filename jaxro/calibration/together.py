@@ -19,7 +19,7 @@ from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .camera import Camera, Measured, Station, misfit
 from .images import Frame
-from .known import NOTHING, prior
+from .known import NOTHING, Known, prior
 from .measured_images import MeasuredImages
 from .models import Model, field_weights, focal_weights
 from .problem_together import Approximate, approximate, solve_together
@@ -128,9 +128,14 @@ class Together(eqx.Module):
 
 
 def calibrate_together(
-    measured: MeasuredImages, model: Model | None = None, *, free_network: bool = False
+    measured: MeasuredImages,
+    model: Model | None = None,
+    known: Known = NOTHING,
+    *,
+    free_network: bool = False,
 ) -> Together:
-    """Adjust several images together; unknown points are eliminated.
+    """Adjust several images together; unknown points are eliminated. `known` is what is
+    known of every camera.
 
     In a free network the known points give approximate values only; the datum is that
     of the stations' approximate values (inner constraints), to which all standard
@@ -148,13 +153,13 @@ def calibrate_together(
     # where the adjustment begins is a program of its own, which all models share
     begin = Program(approximate, {"rays": model.rays}, COMPILE_FAST)(measured)
     static = {"model": model, "free_network": free_network}
-    return Program(_adjust, static, COMPILE_FAST)((measured, begin))
+    return Program(_adjust, static, COMPILE_FAST)((measured, begin, known))
 
 
 def _adjust(
-    data: tuple[MeasuredImages, Approximate], model: Model, free_network: bool
+    data: tuple[MeasuredImages, Approximate, Known], model: Model, free_network: bool
 ) -> Together:
-    measured, begin = data
+    measured, begin, known = data
     u, area = begin.places, begin.area
     focal, field = focal_weights(model, u, area), field_weights(model, u, area)
     number, zones = measured.cameras, focal.shape[2]
@@ -166,10 +171,10 @@ def _adjust(
         field=jnp.zeros((number, field.shape[2])),
     )
     one = jax.tree.map(lambda a: a[0], cameras)
-    known = prior(model, one, NOTHING, begin.frame, begin.sigma, jnp.eye(zones))
+    beforehand = prior(model, one, known, begin.frame, begin.sigma, jnp.eye(zones))
     families = {"station": begin.stations, "camera": cameras, "point": begin.points}
     found = solve_together(
-        measured, begin, focal, field, known, model.rays, families, free_network
+        measured, begin, focal, field, beforehand, model.rays, families, free_network
     )
     return Together(
         measured=measured,

@@ -10,6 +10,7 @@ from several_images import SIGMA, olympus, photos
 from jaxro import calibration
 from jaxro.calibration import Brown, Field, Model
 from jaxro.calibration.choice_together import STRENGTHS, adjust_model
+from jaxro.calibration.known import NOTHING
 from jaxro.calibration.problem_together import approximate
 
 
@@ -38,7 +39,8 @@ def test_the_linear_problem_tells_the_evidence_of_all_strengths():
 
     def tried(number):
         strength = jnp.asarray(STRENGTHS[number])
-        return adjust_model((measured, begin, jnp.asarray(0), strength), model)
+        data = measured, NOTHING, begin, jnp.asarray(0), strength
+        return adjust_model(data, model)
 
     first, second = tried(13), tried(16)
     unknowns = model[0].unknowns * np.log(2.0 * len(places))

@@ -9,9 +9,12 @@ from jaxro import calibration
 from jaxro.calibration import Brown, Model
 
 
-@pytest.mark.parametrize("depth", [0.0, 2.0])
-def test_stations_and_points_are_those_of_a_dense_adjustment(depth):
-    """Of a plane field of targets and of a solid one; five points are known."""
+@pytest.mark.parametrize(
+    ("depth", "focal_sigma"), [(0.0, np.inf), (2.0, np.inf), (2.0, 0.02)]
+)
+def test_stations_and_points_are_those_of_a_dense_adjustment(depth, focal_sigma):
+    """Of a plane field of targets and of a solid one; six points are known, and the
+    focal length may be."""
     rng = np.random.default_rng(4)
     points = rng.uniform([-3, -3, -depth], [3, 3, depth], (14, 3))
     points[[0, 2, 4, 6, 8, 10], :2] = [
@@ -33,18 +36,18 @@ def test_stations_and_points_are_those_of_a_dense_adjustment(depth):
         found = [
             rays(stations[i], moved[[p]])[0] for i, p in zip(image, point, strict=True)
         ]
-        return (
-            (places - unknowns[25:27] - unknowns[24] * np.array(found)) / SIGMA
-        ).ravel()
+        misfits = (places - unknowns[25:27] - unknowns[24] * np.array(found)) / SIGMA
+        return np.append(misfits, (unknowns[24] - 900.1) / focal_sigma)
 
     begin = np.concatenate([truth.ravel(), [900, 512, 384], points[~known].ravel()])
     x, q = gauss_newton(residuals, begin, 8)
-    freedom = 2 * len(places) - len(x)
+    freedom = 2 * len(places) + np.isfinite(focal_sigma) - len(x)
     sigma0 = np.sqrt(np.sum(residuals(x) ** 2) / freedom)
     deviations = sigma0 * np.sqrt(np.diag(q))
 
     measured = calibration.images(*places.T, image, point, given, sigma=SIGMA)
-    found = calibration.calibrate_together(measured)
+    focal = calibration.known(focal=900.1, focal_sigma=focal_sigma)
+    found = calibration.calibrate_together(measured, known=focal)
     assert found.usable
     np.testing.assert_allclose(found.sigma0, sigma0, rtol=1e-6)
     stations = x[:24].reshape(4, 6)
@@ -60,7 +63,7 @@ def test_stations_and_points_are_those_of_a_dense_adjustment(depth):
         np.asarray(found.point_deviations)[~known], own, rtol=1e-3
     )
     left = np.asarray(found.residuals(places, image, point))
-    np.testing.assert_allclose(left.ravel(), -SIGMA * residuals(x), atol=1e-5)
+    np.testing.assert_allclose(left.ravel(), -SIGMA * residuals(x)[:-1], atol=1e-5)
 
 
 def test_a_free_network_has_the_inner_geometry_of_any_datum():
