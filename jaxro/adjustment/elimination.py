@@ -284,7 +284,7 @@ def solve(
     if sums is None:
         q, step, pivots = _kept(n, h, scale, constraint)
         return Solution(n, step, q, None, pivots)
-    inverse, of_blocks = _inverses(sums.v)
+    inverse, of_blocks = inverses(sums.v)
     by_kept = inverse @ sums.w
     rows, flat = sums.w.reshape(-1, n.shape[0]), by_kept.reshape(-1, n.shape[0])
     n, h = n - rows.T @ flat, h - flat.T @ sums.g.reshape(-1)
@@ -335,7 +335,7 @@ def _inverse(matrix: Matrix) -> tuple[Matrix, Float[Array, " some"]]:
     return normal.dense(lower), pivot[None]
 
 
-def _inverses(
+def inverses(
     v: Float[Array, "block d d"],
 ) -> tuple[Float[Array, "block d d"], Float[Array, " block"]]:
     """The inverses of many small matrices, and the smallest pivot of each, element by

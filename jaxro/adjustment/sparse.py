@@ -1,0 +1,303 @@
+"""The adjustment of thousands of blocks, most of which never meet.
+
+Three kinds of families: the `eliminated` one (object points), the `linked` one (photos:
+those that share a point are linked), and the `common` ones, which have few members and
+may be touched by everything (cameras). With y the eliminated, x the linked and c the
+common parameters the normal equations are
+
+    [ S   B   Wᵀ ] [x]   [h]
+    [ Bᵀ  C   Xᵀ ] [c] = [b],    V block-diagonal, S and W nearly empty,
+    [ W   X   V  ] [y]   [g]
+
+and S - Wᵀ V⁻¹ W has a block for each pair of linked members alone. Compiled programs
+linearise, eliminate and read the solution (`sparse_normals`); between them the host
+factorises this matrix (`sparse_factor`). The numbers are those of `adjust` with the
+same terms.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..xla.programs import Program
+from ..xla.settings import COMPILE_FAST
+from .block_tridiagonal import Levels, arrange
+from .blocks import Families, Steps, move, normalise
+from .elimination import layout
+from .levenberg_marquardt import DampedStep, LevenbergMarquardt, promised
+from .losses import AbstractLoss
+from .normal_equations import SINGULAR
+from .results import RESULTS
+from .sparse_factor import Datum, Factored, Singular, factorise, pattern
+from .sparse_normals import (
+    Carried,
+    Data,
+    Roles,
+    all_residuals,
+    carry_back,
+    read_solution,
+    reduce_normals,
+)
+from .terms import Term
+
+FIRST_DAMPING = 1e-14
+"""The first steps are those of Gauss-Newton: the bends of a long strip have eigenvalues
+that any damping to speak of would hide."""
+
+DatumOf = Callable[[Families], Datum]
+"""What a free network is referred to, of the displaced families."""
+
+
+@dataclass(frozen=True)
+class SparseAdjustment:
+    """A finished adjustment.
+
+    `parameters`: by the name of their family. `residuals` (whitened) and `redundancy`:
+    of each term. `cofactors`: of the local parameters of each member of the eliminated
+    and of the linked family, and of all common ones together. `factored` solves for the
+    cofactors of anything else. Without a solution (`result`) the cofactors and
+    redundancies are empty.
+    """
+
+    parameters: dict[str, Any]
+    residuals: list[Float[Array, "_ _"]]
+    redundancy: list[Float[Array, "_ _"]]
+    cofactors: dict[str, Float[Array, "_ _ _"]]
+    common_cofactor: Float[np.ndarray, "_ _"]
+    sigma0: float
+    degrees_of_freedom: int
+    pivot: float
+    iterations: int
+    result: RESULTS
+    factored: Factored | None
+    carried: Carried | None
+
+
+class Problem(NamedTuple):
+    """Terms and start, who meets whom, and in which order the host works on them."""
+
+    data: Data
+    roles: Roles
+    levels: Levels
+
+
+class Minimum(NamedTuple):
+    """The problem with its families where the sum of squares is smallest, how many steps
+    led there, and whether they came to rest."""
+
+    problem: Problem
+    iterations: int
+    result: RESULTS
+
+
+def adjust_sparse(
+    terms: tuple[Term, ...],
+    start: Families,
+    *,
+    eliminate: str,
+    linked: str,
+    datum: DatumOf | None = None,
+    max_steps: int = 30,
+) -> SparseAdjustment:
+    """What `adjust` does for several terms, of thousands of blocks. `eliminate` and
+    `linked` name the two large families; in all others everything may meet everything.
+
+    Conditions are functions of modules or compared by value: programs are kept by them.
+    It cannot be traced, because the host works between the programs. Failures are
+    values of `result`.
+    """
+    problem = prepare(terms, start, eliminate=eliminate, linked=linked)
+    return read(minimise(problem, datum=datum, max_steps=max_steps), datum)
+
+
+def prepare(
+    terms: tuple[Term, ...], start: Families, *, eliminate: str, linked: str
+) -> Problem:
+    """The `Problem` of terms and start. Raises ValueError as `adjust` does."""
+    families = {
+        name: jax.tree.map(lambda a: jnp.asarray(a, float), family)
+        for name, family in start.items()
+    }
+    blocks = layout(families, terms, eliminate)
+    points, links = blocks[eliminate], blocks[linked]
+    common = [b for b in blocks.blocks if b.name not in (eliminate, linked)]
+    sizes = [b.members * b.size for b in common]
+    roles = Roles(
+        eliminated=eliminate,
+        linked=linked,
+        common=tuple(b.name for b in common),
+        points=points.members,
+        point_size=points.size,
+        blocks=links.members,
+        block_size=links.size,
+        begin=tuple(int(k) for k in np.cumsum([0, *sizes[:-1]])) if sizes else (),
+        common_sizes=tuple(b.size for b in common),
+        common_total=sum(sizes),
+    )
+    point, block, direct = [], [], []
+    for term in terms:
+        of = lambda role, term=term: [
+            np.asarray(member) for name, member in term.touches if name == role
+        ]
+        own, others = of(eliminate), of(linked)
+        direct += [(a, b) for k, a in enumerate(others) for b in others[k + 1 :]]
+        for member in others if own else ():
+            point.append(own[0])
+            block.append(member)
+    meets = pattern(np.concatenate(point), np.concatenate(block), direct, roles.blocks)
+    levels = arrange(meets.first, meets.second, roles.blocks, roles.block_size)
+    return Problem(Data(terms, families, meets), roles, levels)
+
+
+@dataclass(frozen=True)
+class _System:
+    """The residuals as a function of displacements, and how to correct these, as
+    `LevenbergMarquardt` asks for them."""
+
+    problem: Problem
+    loss: AbstractLoss | None
+    datum: DatumOf | None
+
+    def __call__(self, steps: Steps) -> list[Array]:
+        options = {"data": self.problem.data, "loss": self.loss}
+        return Program(all_residuals, options, COMPILE_FAST)(steps)
+
+    def damped(self, steps: Steps, damping: Float[Array, ""]) -> DampedStep:
+        """What is subtracted from the displacements. Raises `Singular`."""
+        data, roles, _ = self.problem
+        factored, reduced, carried = self.factorise(steps, damping)
+        x, c = factored.step(np.asarray(reduced.h), np.asarray(reduced.b))
+        x, c = jnp.asarray(x), jnp.asarray(c)
+        back = Program(carry_back, {"data": data}, COMPILE_FAST)
+        y, decrement, spread = back((x, c, carried))
+        step = {roles.linked: x, roles.eliminated: y}
+        for k, name in enumerate(roles.common):
+            own = steps[name].shape
+            begin = roles.begin[k]
+            step[name] = c[begin : begin + own[0] * own[1]].reshape(own)
+        step = {name: step[name] for name in steps}
+        return promised(step, decrement, damping, spread)
+
+    def further(self, steps: Steps, step: Steps) -> Steps:
+        """The displacements followed by a step."""
+        return jax.tree.map(jnp.add, steps, step)
+
+    def factorise(self, steps: Steps, damping: Float[Array, ""]):
+        """The factorised matrix, the reduced system, and what leads back."""
+        data, roles, levels = self.problem
+        options = {"data": data, "roles": roles, "loss": self.loss}
+        program = Program(reduce_normals, options, COMPILE_FAST)
+        reduced, carried = program((steps, damping))
+        datum = None if self.datum is None else self.datum(displaced(data, steps))
+        return factorise(reduced, data.pattern, levels, datum), reduced, carried
+
+
+def minimise(
+    problem: Problem,
+    *,
+    loss: AbstractLoss | None = None,
+    datum: DatumOf | None = None,
+    max_steps: int = 30,
+) -> Minimum:
+    """The least sum of squares, or of rho of them, from where the families stand."""
+    system = _System(problem, loss, datum)
+    solver = LevenbergMarquardt(damping=FIRST_DAMPING)
+    function = lambda steps, system: (system(steps), None)
+    steps, done, result = _origin(problem), False, RESULTS.diverged
+    state = solver.init(function, steps, system, {}, None, None, frozenset())
+    number = 0
+    while number < max_steps and not done:
+        number += 1
+        try:
+            steps, state, _ = solver.step(
+                function, steps, system, {}, state, frozenset()
+            )
+        except Singular:
+            result = RESULTS.rank_deficient
+            break
+        done = bool(state.done)
+    if done:
+        result = RESULTS.successful
+    moved = {
+        name: normalise(family)
+        for name, family in displaced(problem.data, steps).items()
+    }
+    data = problem.data._replace(families=moved)
+    return Minimum(problem._replace(data=data), number, result)
+
+
+def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
+    """Everything that follows from the linearisation at the minimum."""
+    problem = found.problem
+    data, roles, _ = problem
+    system, steps = _System(problem, None, datum), _origin(problem)
+    rows = system(steps)
+    used = sum(
+        int(np.sum(np.asarray(term.mask))) * r.shape[1]
+        for term, r in zip(data.terms, rows, strict=True)
+    )
+    unknowns = roles.points * roles.point_size + roles.blocks * roles.block_size
+    squares = sum(float(jnp.sum(r**2)) for r in rows)
+    adjusted = SparseAdjustment(
+        parameters=data.families,
+        residuals=rows,
+        redundancy=[],
+        cofactors={},
+        common_cofactor=np.zeros((0, 0)),
+        sigma0=np.nan,
+        degrees_of_freedom=used - unknowns - roles.common_total,
+        pivot=0.0,
+        iterations=found.iterations,
+        result=found.result,
+        factored=None,
+        carried=None,
+    )
+    try:
+        factored, _, carried = system.factorise(steps, jnp.zeros(()))
+    except Singular:
+        return replace(adjusted, result=RESULTS.rank_deficient)
+    freedom = adjusted.degrees_of_freedom
+    freedom += 0 if factored.free is None else len(factored.free.datum.rest)
+    q, crossed, corner = factored.select(data.pattern.first, data.pattern.second)
+    options = {"data": data, "roles": roles, "loss": None}
+    solved = carried, jnp.asarray(q), jnp.asarray(crossed), jnp.asarray(corner)
+    of_points, redundancy = Program(read_solution, options, COMPILE_FAST)(solved)
+    pivot = min(factored.pivot, float(jnp.min(carried.pivots)))
+    singular = pivot < SINGULAR
+    return replace(
+        adjusted,
+        redundancy=redundancy,
+        cofactors={
+            roles.eliminated: of_points,
+            roles.linked: jnp.asarray(q[: roles.blocks]),
+        },
+        common_cofactor=corner,
+        sigma0=float(np.sqrt(squares / freedom)) if freedom > 0 else np.nan,
+        degrees_of_freedom=freedom,
+        pivot=pivot,
+        result=RESULTS.rank_deficient if singular else found.result,
+        factored=factored,
+        carried=carried,
+    )
+
+
+def displaced(data: Data, steps: Steps) -> dict[str, Any]:
+    """The families after a displacement."""
+    return {name: move(family, steps[name]) for name, family in data.families.items()}
+
+
+def _origin(problem: Problem) -> Steps:
+    """No displacement."""
+    data, roles, _ = problem
+    sizes = dict(zip(roles.common, roles.common_sizes, strict=True))
+    sizes |= {
+        roles.eliminated: roles.point_size,
+        roles.linked: roles.block_size,
+    }
+    number = lambda name: jax.tree.leaves(data.families[name])[0].shape[0]
+    return {name: jnp.zeros((number(name), sizes[name])) for name in data.families}

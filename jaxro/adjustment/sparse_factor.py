@@ -1,0 +1,276 @@
+"""Which members of a family are linked, and the factorised matrix of their normal
+equations with everything that is read of it: solutions, and parts of the inverse.
+
+Everything here is NumPy on the host: it calls LAPACK, which compiled programs must not.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from . import block_tridiagonal as tridiagonal
+from .block_tridiagonal import Levels, Singular as Singular
+
+CHUNK = 1 << 14
+"""Pairs of sightings that are worked on at once."""
+
+
+class Pattern(NamedTuple):
+    """Which blocks of the matrix there are, and where they come from.
+
+    A sighting is a group that touches an eliminated and a linked block: `point` and
+    `block`. Slot s holds N[first[s], second[s]], first >= second; the slots of the
+    diagonal come first. Two sightings `p`, `q` of one point go to a `slot` (in chunks;
+    beyond the last slot where there are no more); `both` where they are of two
+    different blocks. `direct`: the slots of groups that touch two linked blocks.
+    """
+
+    point: Int[np.ndarray, " sighting"]
+    block: Int[np.ndarray, " sighting"]
+    first: Int[np.ndarray, " slot"]
+    second: Int[np.ndarray, " slot"]
+    p: Int[np.ndarray, "chunk pair"]
+    q: Int[np.ndarray, "chunk pair"]
+    slot: Int[np.ndarray, "chunk pair"]
+    both: Bool[np.ndarray, "chunk pair"]
+    direct: tuple[Int[np.ndarray, " group"], ...]
+
+
+class Reduced(NamedTuple):
+    """The normal equations after the elimination: the blocks of S, its right-hand side,
+    B, C and the right-hand side of the common parameters."""
+
+    blocks: Float[jax.Array, "slot d d"]
+    h: Float[jax.Array, "block d"]
+    border: Float[jax.Array, "block d c"]
+    common: Float[jax.Array, "c c"]
+    b: Float[jax.Array, " c"]
+
+
+class Anchor(NamedTuple):
+    """A direction in which a member is held while a free network is solved."""
+
+    block: int
+    direction: Float[np.ndarray, " d"]
+
+
+class Datum(NamedTuple):
+    """What a free network is referred to: `rows` times the step of the linked blocks
+    is to become `rest`. The `anchors`, as many, determine the solution that is moved
+    there."""
+
+    rows: Float[np.ndarray, "k block d"]
+    rest: Float[np.ndarray, " k"]
+    anchors: tuple[Anchor, ...]
+
+
+def pattern(
+    point: Int[np.ndarray, " sighting"],
+    block: Int[np.ndarray, " sighting"],
+    direct: list[tuple[Int[np.ndarray, " group"], Int[np.ndarray, " group"]]],
+    blocks: int,
+) -> Pattern:
+    """The `Pattern` of sightings and of groups that touch two linked blocks."""
+    order = np.argsort(point, kind="stable")
+    pairs = [np.stack([order, order])]
+    for lag in range(1, len(order)):
+        p, q = order[lag:], order[:-lag]
+        same = point[p] == point[q]
+        if not np.any(same):
+            break
+        p, q = p[same], q[same]
+        swap = block[p] < block[q]
+        pairs.append(np.stack([np.where(swap, q, p), np.where(swap, p, q)]))
+        again = block[p] == block[q]
+        pairs.append(np.stack([q[again], p[again]]))
+    p, q = np.concatenate(pairs, axis=1)
+    keys = [block[p] * blocks + block[q]]
+    keys += [np.maximum(a, b) * blocks + np.minimum(a, b) for a, b in direct]
+    own = np.arange(blocks) * (blocks + 1)
+    apart = np.setdiff1d(np.concatenate(keys), own)
+    every = np.concatenate([own, apart])
+    sorted_slots = np.argsort(every)
+    find = lambda key: sorted_slots[np.searchsorted(every, key, sorter=sorted_slots)]
+    slot = find(keys[0])
+    by_slot = np.argsort(slot, kind="stable")
+    p, q, slot = p[by_slot], q[by_slot], slot[by_slot]
+    chunk = min(CHUNK, len(p))
+    missing = -len(p) % chunk
+    in_chunks = lambda a, none: np.pad(a, (0, missing), constant_values=none).reshape(
+        -1, chunk
+    )
+    return Pattern(
+        point=point,
+        block=block,
+        first=every // blocks,
+        second=every % blocks,
+        p=in_chunks(p, 0),
+        q=in_chunks(q, 0),
+        slot=in_chunks(slot, len(every)),
+        both=in_chunks(block[p] != block[q], False),
+        direct=tuple(find(key) for key in keys[1:]),
+    )
+
+
+@dataclass
+class Factored:
+    """The factorised matrix of linked and common parameters.
+
+    `by_border`: S⁻¹ B, in the order of the places; `corner`: the cofactors of the
+    common parameters; `free` is None unless the network is free.
+    """
+
+    levels: Levels
+    factor: tridiagonal.Factor
+    by_border: Float[np.ndarray, "row c"]
+    corner: Float[np.ndarray, "c c"]
+    size: int
+    pivot: float
+    free: "Free | None" = None
+
+    def solve(
+        self,
+        right: Float[np.ndarray, "block d k"],
+        common: Float[np.ndarray, "c k"],
+    ) -> tuple[Float[np.ndarray, "block d k"], Float[np.ndarray, "c k"]]:
+        """The solution for some right-hand sides; of a free network one that moves the
+        datum by nothing."""
+        x, c = self._solve(right, common)
+        return (x, c) if self.free is None else self.free.move(x, c, to_rest=False)
+
+    def step(
+        self, right: Float[np.ndarray, "block d"], common: Float[np.ndarray, " c"]
+    ) -> tuple[Float[np.ndarray, "block d"], Float[np.ndarray, " c"]]:
+        """The solution that brings a free network to its datum."""
+        x, c = self._solve(right[:, :, None], common[:, None])
+        if self.free is not None:
+            x, c = self.free.move(x, c, to_rest=True)
+        return x[:, :, 0], c[:, 0]
+
+    def select(
+        self, first: Int[np.ndarray, " slot"], second: Int[np.ndarray, " slot"]
+    ) -> tuple[
+        Float[np.ndarray, "slot d d"],
+        Float[np.ndarray, "block d c"],
+        Float[np.ndarray, "c c"],
+    ]:
+        """The cofactors Q[first, second] of linked members (which the pattern holds),
+        of each of them with the common parameters, and of these."""
+        inverse = tridiagonal.select_inverse(self.factor)
+        q = tridiagonal.read_blocks(self.levels, inverse, first, second, self.size)
+        y = self._by_member(self.by_border)
+        crossed = -y @ self.corner
+        q = q - np.einsum("sic,sjc->sij", crossed[first], y[second])
+        if self.free is None:
+            return q, crossed, self.corner
+        free, rows = self.free, len(self.levels.order) * self.size
+        at = lambda a: self._by_member(a[:rows], ordered=False)
+        links = at(free.movements), at(free.spread)
+        common = free.movements[rows:], free.spread[rows:]
+        of = lambda slots: (links[0][slots], links[1][slots])
+        return (
+            q + free.correction(of(first), of(second)),
+            crossed + free.correction(links, common),
+            self.corner + free.correction(common, common),
+        )
+
+    def _solve(self, right, common):
+        n, d, k = right.shape
+        x = right[self.levels.order].reshape(n * d, k)
+        x = tridiagonal.solve(self.factor, x)
+        ordered = right[self.levels.order].reshape(n * d, k)
+        c = self.corner @ (common - self.by_border.T @ ordered)
+        return self._by_member(x - self.by_border @ c), c
+
+    def _by_member(self, rows, ordered: bool = True):
+        """Rows in the order of the places as (member, d, column)."""
+        parts = rows.reshape(len(self.levels.order), self.size, -1)
+        return parts[self.levels.place] if ordered else parts
+
+
+@dataclass
+class Free:
+    """What a free network can do without any residual changing: the `movements` G; K =
+    (R G)⁻¹ with the rows R of the datum, which turns what is missing to the datum into
+    a movement; and `spread`, F = Q Rᵀ, with the cofactors Q of the anchored network.
+    Those of the datum are P Q Pᵀ, P = 1 - G K R.
+    """
+
+    datum: Datum
+    movements: Float[np.ndarray, "number k"]
+    held: Float[np.ndarray, "k k"]
+    spread: Float[np.ndarray, "number k"]
+
+    @property
+    def rows(self) -> Float[np.ndarray, "k row"]:
+        """R, of the linked parameters."""
+        return self.datum.rows.reshape(len(self.datum.rest), -1)
+
+    def move(self, x, c, *, to_rest: bool):
+        """A solution, moved to the datum's rest, or to zero."""
+        flat = x.reshape(self.rows.shape[1], -1)
+        missing = -self.rows @ flat
+        if to_rest:
+            missing = missing + self.datum.rest[:, None]
+        moved = self.movements @ (self.held @ missing)
+        return x + moved[: len(flat)].reshape(x.shape), c + moved[len(flat) :]
+
+    def correction(self, one, other):
+        """P Q Pᵀ - Q between parameters, each given by their rows of G and of F."""
+        (g, f), (g_other, f_other) = one, other
+        turned = lambda a: np.swapaxes(a, -1, -2)
+        inner = self.held @ (self.rows @ self.spread[: self.rows.shape[1]])
+        twice = g @ (inner @ self.held.T) @ turned(g_other)
+        once = g @ self.held @ turned(f_other)
+        return twice - once - f @ self.held.T @ turned(g_other)
+
+
+def factorise(
+    reduced: Reduced, of: Pattern, levels: Levels, datum: Datum | None = None
+) -> Factored:
+    """The `Factored` matrix. Raises `Singular` where it is not positive definite."""
+    blocks, border = np.array(reduced.blocks), np.asarray(reduced.border)
+    n, d, c = border.shape
+    held = []
+    for block, direction in () if datum is None else datum.anchors:
+        weight = direction @ (np.diagonal(blocks[block]) * direction)
+        held.append((block, direction * np.sqrt(weight)))
+    for block, row in held:
+        blocks[block] += np.outer(row, row)
+    parts = tridiagonal.assemble(levels, of.first, of.second, blocks)
+    factor = tridiagonal.factorise(*parts)
+    by_border = tridiagonal.solve(factor, border[levels.order].reshape(n * d, c))
+    ordered = border[levels.order].reshape(n * d, c)
+    corner, pivot = _inverse(np.asarray(reduced.common) - ordered.T @ by_border)
+    pivot = min(pivot, factor.pivot)
+    found = Factored(levels, factor, by_border, corner, d, pivot)
+    if datum is None:
+        return found
+    # what the anchors hold alone is what the network leaves free
+    k = len(held)
+    right = np.zeros((n, d, k))
+    for j, (block, row) in enumerate(held):
+        right[block, :, j] = row
+    none = np.zeros((c, k))
+    flat = lambda x, c: np.concatenate([x.reshape(n * d, -1), c])
+    movements = flat(*found.solve(right, none))
+    spread = flat(*found.solve(np.moveaxis(datum.rows, 0, 2), none))
+    inverse = np.linalg.inv(datum.rows.reshape(k, -1) @ movements[: n * d])
+    found.free = Free(datum, movements, inverse, spread)
+    return found
+
+
+def _inverse(matrix: Float[np.ndarray, "c c"]) -> tuple[np.ndarray, float]:
+    """The inverse of a small positive definite matrix, and its least pivot."""
+    if len(matrix) == 0:
+        return matrix, np.inf
+    scale = np.sqrt(np.maximum(np.diagonal(matrix), np.finfo(float).tiny))
+    try:
+        factor = np.linalg.cholesky(matrix / np.outer(scale, scale))
+    except np.linalg.LinAlgError:
+        raise Singular from None
+    half = np.linalg.inv(factor) / scale
+    return half.T @ half, float(np.min(np.diagonal(factor)) ** 2)
