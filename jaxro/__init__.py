@@ -14,6 +14,7 @@ if "JAX_ENABLE_X64" not in _os.environ:
 from . import (
     adjustment as adjustment,
     assessment as assessment,
+    block as block,
     calibration as calibration,
     orientation as orientation,
     rejection as rejection,

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-Rows = Float[np.ndarray, "row column"]
+Rows = Float[np.ndarray, "_ _"]
 
 LEAST_ROWS = 96
 """Rows of a level, at least: products of smaller matrices take as long."""

@@ -15,14 +15,14 @@ factorises this matrix (`sparse_factor`). The numbers are those of `adjust` with
 same terms.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
@@ -33,7 +33,15 @@ from .levenberg_marquardt import DampedStep, LevenbergMarquardt, promised
 from .losses import AbstractLoss
 from .normal_equations import SINGULAR
 from .results import RESULTS
-from .sparse_factor import Datum, Factored, Singular, factorise, pattern
+from .sparse_factor import (
+    Datum,
+    Factored,
+    Singular,
+    Slots,
+    factorise,
+    pattern,
+    room_for,
+)
 from .sparse_normals import (
     Carried,
     Data,
@@ -48,6 +56,13 @@ from .terms import Term
 FIRST_DAMPING = 1e-14
 """The first steps are those of Gauss-Newton: the bends of a long strip have eigenvalues
 that any damping to speak of would hide."""
+
+LEAST_WEIGHT = 1e-10
+"""A weight is at least this, so that nothing is divided by zero."""
+
+SHORT = 1e-6
+"""A step of so many standard deviations is the last one: what the next one would be is
+the square of it."""
 
 DatumOf = Callable[[Families], Datum]
 """What a free network is referred to, of the displaced families."""
@@ -65,9 +80,9 @@ class SparseAdjustment:
     """
 
     parameters: dict[str, Any]
-    residuals: list[Float[Array, "_ _"]]
-    redundancy: list[Float[Array, "_ _"]]
-    cofactors: dict[str, Float[Array, "_ _ _"]]
+    residuals: list[Float[np.ndarray, "_ _"]]
+    redundancy: list[Float[np.ndarray, "_ _"]]
+    cofactors: dict[str, Float[np.ndarray, "_ _ _"]]
     common_cofactor: Float[np.ndarray, "_ _"]
     sigma0: float
     degrees_of_freedom: int
@@ -79,11 +94,25 @@ class SparseAdjustment:
 
 
 class Problem(NamedTuple):
-    """Terms and start, who meets whom, and in which order the host works on them."""
+    """Terms and start with some room, who meets whom, in which order the host works on
+    them; and the true numbers: of groups of each term, of members of each family."""
 
     data: Data
     roles: Roles
+    slots: Slots
     levels: Levels
+    groups: tuple[int, ...]
+    members: dict[str, int]
+
+    def at(self, other: "Problem") -> "Problem":
+        """The problem with the families of another one."""
+        return self._replace(data=self.data._replace(families=other.data.families))
+
+    def weighted(self, weights: Sequence[Float[np.ndarray, " group"]]) -> "Problem":
+        """The problem with the variances of the groups of each term divided by
+        weights."""
+        terms = map(_weighted, self.data.terms, weights)
+        return self._replace(data=self.data._replace(terms=tuple(terms)))
 
 
 class Minimum(NamedTuple):
@@ -120,26 +149,18 @@ def prepare(
 ) -> Problem:
     """The `Problem` of terms and start. Raises ValueError as `adjust` does."""
     families = {
-        name: jax.tree.map(lambda a: jnp.asarray(a, float), family)
+        name: jax.tree.map(lambda a: np.asarray(a, float), family)
         for name, family in start.items()
     }
     blocks = layout(families, terms, eliminate)
-    points, links = blocks[eliminate], blocks[linked]
-    common = [b for b in blocks.blocks if b.name not in (eliminate, linked)]
+    members = {b.name: b.members for b in blocks.blocks}
+    groups = tuple(len(term.mask) for term in terms)
+    terms = tuple(_term_with_room(term) for term in terms)
+    large = (eliminate, linked)
+    families |= {name: _with_room(families[name]) for name in large}
+    common = [b for b in blocks.blocks if b.name not in large]
     sizes = [b.members * b.size for b in common]
-    roles = Roles(
-        eliminated=eliminate,
-        linked=linked,
-        common=tuple(b.name for b in common),
-        points=points.members,
-        point_size=points.size,
-        blocks=links.members,
-        block_size=links.size,
-        begin=tuple(int(k) for k in np.cumsum([0, *sizes[:-1]])) if sizes else (),
-        common_sizes=tuple(b.size for b in common),
-        common_total=sum(sizes),
-    )
-    point, block, direct = [], [], []
+    point, block, use, direct = [], [], [], []
     for term in terms:
         of = lambda role, term=term: [
             np.asarray(member) for name, member in term.touches if name == role
@@ -149,9 +170,77 @@ def prepare(
         for member in others if own else ():
             point.append(own[0])
             block.append(member)
-    meets = pattern(np.concatenate(point), np.concatenate(block), direct, roles.blocks)
-    levels = arrange(meets.first, meets.second, roles.blocks, roles.block_size)
-    return Problem(Data(terms, families, meets), roles, levels)
+            use.append(np.asarray(term.mask))
+    number = room_for(members[linked])
+    together = [np.concatenate(a) for a in (point, block, use)]
+    meets, slots = pattern(*together, direct, number)
+    size = blocks[linked].size
+    roles = Roles(
+        eliminated=eliminate,
+        linked=linked,
+        common=tuple(b.name for b in common),
+        points=room_for(members[eliminate]),
+        point_size=blocks[eliminate].size,
+        blocks=number,
+        block_size=size,
+        begin=tuple(int(k) for k in np.cumsum([0, *sizes[:-1]])) if sizes else (),
+        common_sizes=tuple(b.size for b in common),
+        common_total=sum(sizes),
+        slots=room_for(len(slots.first)),
+    )
+    levels = arrange(slots.first, slots.second, number, size)
+    data = Data(terms, families, meets)
+    return Problem(data, roles, slots, levels, groups, members)
+
+
+def _with_room(tree: Any) -> Any:
+    """All leaves with more rows, which repeat the first one."""
+
+    def longer(a: ArrayLike) -> np.ndarray:
+        # in NumPy: JAX would compile this for every number of rows
+        rows = np.asarray(a)
+        missing = room_for(len(rows)) - len(rows)
+        return np.concatenate([rows, np.repeat(rows[:1], missing, axis=0)])
+
+    return jax.tree.map(longer, tree)
+
+
+def _term_with_room(term: Term) -> Term:
+    """The term with more groups, which are not in use."""
+    longer = _with_room(
+        (term.observations, term.cofactor, [member for _, member in term.touches])
+    )
+    observations, cofactor, touched = longer
+    names = [name for name, _ in term.touches]
+    use = np.zeros(room_for(len(term.mask)), bool)
+    use[: len(term.mask)] = np.asarray(term.mask)
+    return Term(
+        term.condition,
+        observations,
+        cofactor,
+        touches=list(zip(names, touched, strict=True)),
+        mask=use,
+    )
+
+
+def _weighted(term: Term, weight: Float[np.ndarray, " group"]) -> Term:
+    factor = np.ones(len(term.mask))
+    factor[: len(weight)] = 1 / np.maximum(weight, LEAST_WEIGHT)
+    divided = lambda q: np.asarray(q) * factor.reshape(-1, *(1,) * (np.ndim(q) - 1))
+    cofactor = jax.tree.map(divided, term.cofactor)
+    return Term(
+        term.condition,
+        term.observations,
+        cofactor,
+        touches=term.touches,
+        mask=term.mask,
+    )
+
+
+def residuals_of(problem: Problem) -> list[Float[np.ndarray, "_ _"]]:
+    """The whitened residuals of each term where the families stand."""
+    rows = _System(problem, None, None)(_origin(problem))
+    return [np.asarray(a)[:n] for a, n in zip(rows, problem.groups, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -169,7 +258,7 @@ class _System:
 
     def damped(self, steps: Steps, damping: Float[Array, ""]) -> DampedStep:
         """What is subtracted from the displacements. Raises `Singular`."""
-        data, roles, _ = self.problem
+        data, roles = self.problem.data, self.problem.roles
         factored, reduced, carried = self.factorise(steps, damping)
         x, c = factored.step(np.asarray(reduced.h), np.asarray(reduced.b))
         x, c = jnp.asarray(x), jnp.asarray(c)
@@ -189,12 +278,14 @@ class _System:
 
     def factorise(self, steps: Steps, damping: Float[Array, ""]):
         """The factorised matrix, the reduced system, and what leads back."""
-        data, roles, levels = self.problem
+        problem = self.problem
+        data, roles = problem.data, problem.roles
         options = {"data": data, "roles": roles, "loss": self.loss}
         program = Program(reduce_normals, options, COMPILE_FAST)
         reduced, carried = program((steps, damping))
         datum = None if self.datum is None else self.datum(displaced(data, steps))
-        return factorise(reduced, data.pattern, levels, datum), reduced, carried
+        factored = factorise(reduced, problem.slots, problem.levels, datum)
+        return factored, reduced, carried
 
 
 def minimise(
@@ -206,7 +297,7 @@ def minimise(
 ) -> Minimum:
     """The least sum of squares, or of rho of them, from where the families stand."""
     system = _System(problem, loss, datum)
-    solver = LevenbergMarquardt(damping=FIRST_DAMPING)
+    solver = LevenbergMarquardt(rtol=SHORT, damping=FIRST_DAMPING)
     function = lambda steps, system: (system(steps), None)
     steps, done, result = _origin(problem), False, RESULTS.diverged
     state = solver.init(function, steps, system, {}, None, None, frozenset())
@@ -223,34 +314,34 @@ def minimise(
         done = bool(state.done)
     if done:
         result = RESULTS.successful
-    moved = {
-        name: normalise(family)
-        for name, family in displaced(problem.data, steps).items()
-    }
-    data = problem.data._replace(families=moved)
+    data = problem.data._replace(families=displaced(problem.data, steps))
     return Minimum(problem._replace(data=data), number, result)
 
 
 def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
     """Everything that follows from the linearisation at the minimum."""
     problem = found.problem
-    data, roles, _ = problem
+    data, roles, members = problem.data, problem.roles, problem.members
     system, steps = _System(problem, None, datum), _origin(problem)
-    rows = system(steps)
+    rows = residuals_of(problem)
     used = sum(
         int(np.sum(np.asarray(term.mask))) * r.shape[1]
         for term, r in zip(data.terms, rows, strict=True)
     )
-    unknowns = roles.points * roles.point_size + roles.blocks * roles.block_size
-    squares = sum(float(jnp.sum(r**2)) for r in rows)
+    unknowns = members[roles.eliminated] * roles.point_size
+    unknowns += members[roles.linked] * roles.block_size + roles.common_total
+    parameters = {
+        name: jax.tree.map(lambda a, n=members[name]: np.asarray(a)[:n], family)
+        for name, family in data.families.items()
+    }
     adjusted = SparseAdjustment(
-        parameters=data.families,
+        parameters=parameters,
         residuals=rows,
         redundancy=[],
         cofactors={},
         common_cofactor=np.zeros((0, 0)),
         sigma0=np.nan,
-        degrees_of_freedom=used - unknowns - roles.common_total,
+        degrees_of_freedom=used - unknowns,
         pivot=0.0,
         iterations=found.iterations,
         result=found.result,
@@ -263,18 +354,23 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
         return replace(adjusted, result=RESULTS.rank_deficient)
     freedom = adjusted.degrees_of_freedom
     freedom += 0 if factored.free is None else len(factored.free.datum.rest)
-    q, crossed, corner = factored.select(data.pattern.first, data.pattern.second)
+    q, crossed, corner = factored.select(problem.slots)
+    room = np.zeros((roles.slots - len(q), *q.shape[1:]))
     options = {"data": data, "roles": roles, "loss": None}
-    solved = carried, jnp.asarray(q), jnp.asarray(crossed), jnp.asarray(corner)
+    of_slots = jnp.asarray(np.concatenate([q, room]))
+    solved = carried, of_slots, jnp.asarray(crossed), jnp.asarray(corner)
     of_points, redundancy = Program(read_solution, options, COMPILE_FAST)(solved)
     pivot = min(factored.pivot, float(jnp.min(carried.pivots)))
     singular = pivot < SINGULAR
+    squares = sum(float(np.sum(r**2)) for r in rows)
     return replace(
         adjusted,
-        redundancy=redundancy,
+        redundancy=[
+            np.asarray(a)[:n] for a, n in zip(redundancy, problem.groups, strict=True)
+        ],
         cofactors={
-            roles.eliminated: of_points,
-            roles.linked: jnp.asarray(q[: roles.blocks]),
+            roles.eliminated: np.asarray(of_points)[: members[roles.eliminated]],
+            roles.linked: q[: members[roles.linked]],
         },
         common_cofactor=corner,
         sigma0=float(np.sqrt(squares / freedom)) if freedom > 0 else np.nan,
@@ -287,13 +383,20 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
 
 
 def displaced(data: Data, steps: Steps) -> dict[str, Any]:
-    """The families after a displacement."""
-    return {name: move(family, steps[name]) for name, family in data.families.items()}
+    """The families after a displacement, in their standard form."""
+    return Program(_displaced, {}, COMPILE_FAST)((data.families, steps))
+
+
+def _displaced(data: tuple[dict[str, Any], Steps]) -> dict[str, Any]:
+    families, steps = data
+    return {
+        name: normalise(move(family, steps[name])) for name, family in families.items()
+    }
 
 
 def _origin(problem: Problem) -> Steps:
     """No displacement."""
-    data, roles, _ = problem
+    data, roles = problem.data, problem.roles
     sizes = dict(zip(roles.common, roles.common_sizes, strict=True))
     sizes |= {
         roles.eliminated: roles.point_size,

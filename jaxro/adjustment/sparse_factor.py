@@ -17,26 +17,41 @@ from .block_tridiagonal import Levels, Singular as Singular
 CHUNK = 1 << 14
 """Pairs of sightings that are worked on at once."""
 
+BEYOND = 1 << 30
+"""A slot that there is not."""
+
+
+def room_for(number: int) -> int:
+    """Room for a number of things: at most a quarter more, so that problems of nearly
+    the same size share their programs."""
+    step = 1 << max(0, (number - 1).bit_length() - 3)
+    return -(-number // step) * step
+
 
 class Pattern(NamedTuple):
-    """Which blocks of the matrix there are, and where they come from.
+    """Where the blocks of the matrix come from.
 
     A sighting is a group that touches an eliminated and a linked block: `point` and
-    `block`. Slot s holds N[first[s], second[s]], first >= second; the slots of the
-    diagonal come first. Two sightings `p`, `q` of one point go to a `slot` (in chunks;
-    beyond the last slot where there are no more); `both` where they are of two
-    different blocks. `direct`: the slots of groups that touch two linked blocks.
+    `block`. Two sightings `p`, `q` of one point go to a `slot` (in chunks; beyond the
+    last slot where there are no more); `both` where they are of two different blocks.
+    `direct`: the slots of groups that touch two linked blocks.
     """
 
     point: Int[np.ndarray, " sighting"]
     block: Int[np.ndarray, " sighting"]
-    first: Int[np.ndarray, " slot"]
-    second: Int[np.ndarray, " slot"]
     p: Int[np.ndarray, "chunk pair"]
     q: Int[np.ndarray, "chunk pair"]
     slot: Int[np.ndarray, "chunk pair"]
     both: Bool[np.ndarray, "chunk pair"]
     direct: tuple[Int[np.ndarray, " group"], ...]
+
+
+class Slots(NamedTuple):
+    """Slot s holds the block N[first[s], second[s]], first >= second; the slots of the
+    diagonal come first."""
+
+    first: Int[np.ndarray, " slot"]
+    second: Int[np.ndarray, " slot"]
 
 
 class Reduced(NamedTuple):
@@ -70,11 +85,14 @@ class Datum(NamedTuple):
 def pattern(
     point: Int[np.ndarray, " sighting"],
     block: Int[np.ndarray, " sighting"],
+    use: Bool[np.ndarray, " sighting"],
     direct: list[tuple[Int[np.ndarray, " group"], Int[np.ndarray, " group"]]],
     blocks: int,
-) -> Pattern:
-    """The `Pattern` of sightings and of groups that touch two linked blocks."""
-    order = np.argsort(point, kind="stable")
+) -> tuple[Pattern, Slots]:
+    """The `Pattern` of sightings, of which some are in use, and of groups that touch
+    two linked blocks."""
+    order = np.flatnonzero(use)
+    order = order[np.argsort(point[order], kind="stable")]
     pairs = [np.stack([order, order])]
     for lag in range(1, len(order)):
         p, q = order[lag:], order[:-lag]
@@ -97,22 +115,21 @@ def pattern(
     slot = find(keys[0])
     by_slot = np.argsort(slot, kind="stable")
     p, q, slot = p[by_slot], q[by_slot], slot[by_slot]
-    chunk = min(CHUNK, len(p))
-    missing = -len(p) % chunk
+    chunk = min(CHUNK, room_for(len(p)))
+    missing = -(-room_for(len(p)) // chunk) * chunk - len(p)
     in_chunks = lambda a, none: np.pad(a, (0, missing), constant_values=none).reshape(
         -1, chunk
     )
-    return Pattern(
+    meets = Pattern(
         point=point,
         block=block,
-        first=every // blocks,
-        second=every % blocks,
         p=in_chunks(p, 0),
         q=in_chunks(q, 0),
-        slot=in_chunks(slot, len(every)),
+        slot=in_chunks(slot, BEYOND),
         both=in_chunks(block[p] != block[q], False),
         direct=tuple(find(key) for key in keys[1:]),
     )
+    return meets, Slots(every // blocks, every % blocks)
 
 
 @dataclass
@@ -151,14 +168,15 @@ class Factored:
         return x[:, :, 0], c[:, 0]
 
     def select(
-        self, first: Int[np.ndarray, " slot"], second: Int[np.ndarray, " slot"]
+        self, slots: Slots
     ) -> tuple[
         Float[np.ndarray, "slot d d"],
         Float[np.ndarray, "block d c"],
         Float[np.ndarray, "c c"],
     ]:
-        """The cofactors Q[first, second] of linked members (which the pattern holds),
-        of each of them with the common parameters, and of these."""
+        """The cofactors Q[first, second] of linked members, of each of them with the
+        common parameters, and of these."""
+        first, second = slots
         inverse = tridiagonal.select_inverse(self.factor)
         q = tridiagonal.read_blocks(self.levels, inverse, first, second, self.size)
         y = self._by_member(self.by_border)
@@ -229,10 +247,11 @@ class Free:
 
 
 def factorise(
-    reduced: Reduced, of: Pattern, levels: Levels, datum: Datum | None = None
+    reduced: Reduced, of: Slots, levels: Levels, datum: Datum | None = None
 ) -> Factored:
     """The `Factored` matrix. Raises `Singular` where it is not positive definite."""
-    blocks, border = np.array(reduced.blocks), np.asarray(reduced.border)
+    blocks = np.array(reduced.blocks)[: len(of.first)]
+    border = np.asarray(reduced.border)
     n, d, c = border.shape
     held = []
     for block, direction in () if datum is None else datum.anchors:

@@ -31,6 +31,7 @@ class Roles(NamedTuple):
     begin: tuple[int, ...]
     common_sizes: tuple[int, ...]
     common_total: int
+    slots: int
 
     def columns(self, name: str, member: Int[Array, " group"]) -> Int[Array, "group d"]:
         """The places of the parameters of members of a common family."""
@@ -100,7 +101,7 @@ def reduce_normals(
     n, d, c = roles.blocks, roles.block_size, roles.common_total
     e, p = roles.points, roles.point_size
     of = data.pattern
-    blocks = jnp.zeros((len(of.first), d, d))
+    blocks = jnp.zeros((roles.slots, d, d))
     h, border = jnp.zeros((n, d)), jnp.zeros((n, d, c))
     common, b = jnp.zeros((c, c)), jnp.zeros(c)
     v, g, x = jnp.zeros((e, p, p)), jnp.zeros((e, p)), jnp.zeros((e, p, c))
@@ -131,9 +132,9 @@ def reduce_normals(
     right = h, b
     diagonal = lambda a: jnp.diagonal(a, axis1=-2, axis2=-1)
     diagonals = diagonal(blocks[:n]), diagonal(common), diagonal(v)
-    blocks = blocks.at[:n].add(_diagonal(damping * diagonals[0]))
+    blocks = blocks.at[:n].add(_diagonal(_more(diagonals[0], damping)))
     common = common + jnp.diag(damping * diagonals[1])
-    inverse, pivots = inverses(v + _diagonal(damping * diagonals[2]))
+    inverse, pivots = inverses(v + _diagonal(_more(diagonals[2], damping)))
     w = jnp.concatenate(w)
     k = _times(inverse[of.point], w)
     carried = Carried(inverse, pivots, g, x, w, right, diagonals)
@@ -284,6 +285,15 @@ def _touched(term: Term, part: Linearised, roles: Roles) -> Touched:
 def _meeting(links: list) -> list:
     """All two linked blocks that one group touches."""
     return [(a, b) for k, a in enumerate(links) for b in links[k + 1 :]]
+
+
+def _more(
+    diagonal: Float[Array, "member k"], damping: Float[Array, ""]
+) -> Float[Array, "member k"]:
+    """What is added to the diagonal: a part of it; 1 for members that nothing touches,
+    which then stand still."""
+    untouched = jnp.all(diagonal == 0, axis=1)[:, None]
+    return jnp.where(untouched, 1.0, damping * diagonal)
 
 
 def _diagonal(entries: Float[Array, "member k"]) -> Float[Array, "member k k"]:

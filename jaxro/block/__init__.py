@@ -1,0 +1,13 @@
+"""Strips and blocks of oriented pairs on the ground."""
+
+from .adjust import BlockAdjustment as BlockAdjustment, adjust_block as adjust_block
+from .chain import Unjoined as Unjoined, chain as chain, models_of as models_of
+from .measured_block import (
+    Ground as Ground,
+    MeasuredBlock as MeasuredBlock,
+    from_pairs as from_pairs,
+    ground as ground,
+)
+from .mock_block import Flight as Flight, mock_block as mock_block, pairs_of as pairs_of
+from .place import TooLittleControl as TooLittleControl, place as place
+from .wrong import adjust_without_wrong as adjust_without_wrong

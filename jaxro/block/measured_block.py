@@ -1,0 +1,132 @@
+"""What was measured of a strip or block: places of points on photos, each place once,
+and what is known of the ground.
+
+Photo coordinates are those of `geometry.pairs`: x to the right, y up, origin at the
+principal point, in any unit that the focal length has, too. Everything is NumPy.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import ArrayLike, Bool, Float, Int
+
+from ..batches.ragged import Ragged
+
+AGREE = 1e-9
+"""Relative difference up to which two places of a point on a photo are one
+measurement."""
+
+
+class MeasuredBlock(NamedTuple):
+    """Places of points on photos, ray by ray; `photo` and `point` count from 0 in
+    `photos` and `points`, the names. `focal`: of each photo; `sigma`: the standard
+    deviation of a coordinate of each ray."""
+
+    photos: tuple[str, ...]
+    points: tuple[str, ...]
+    photo: Int[np.ndarray, " ray"]
+    point: Int[np.ndarray, " ray"]
+    x: Float[np.ndarray, " ray"]
+    y: Float[np.ndarray, " ray"]
+    sigma: Float[np.ndarray, " ray"]
+    focal: Float[np.ndarray, " photo"]
+
+    def without(self, rays: Bool[np.ndarray, " ray"]) -> "MeasuredBlock":
+        """The block without some rays; photos and points keep their numbers."""
+        kept = lambda a: a[~rays]
+        return self._replace(
+            photo=kept(self.photo),
+            point=kept(self.point),
+            x=kept(self.x),
+            y=kept(self.y),
+            sigma=kept(self.sigma),
+        )
+
+
+class Ground(NamedTuple):
+    """Points of the ground that are known: NaN for a coordinate that is not; `sigma` of
+    each coordinate; `check`: known, but kept out of the adjustment, which they judge."""
+
+    points: tuple[str, ...]
+    coordinates: Float[np.ndarray, "known 3"]
+    sigma: Float[np.ndarray, "known 3"]
+    check: Bool[np.ndarray, " known"]
+
+
+def ground(
+    points: Sequence[str],
+    coordinates: Float[ArrayLike, "known 3"],
+    sigma: Float[ArrayLike, "..."],
+    check: Bool[ArrayLike, " known"] | None = None,
+) -> Ground:
+    """Known points. Raises ValueError for a name that occurs twice, and for standard
+    deviations that are not positive."""
+    at = np.asarray(coordinates, float)
+    names = tuple(points)
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"ground: point {twice!r} occurs twice")
+    deviation = np.broadcast_to(np.asarray(sigma, float), at.shape)
+    wrong = np.isfinite(at) & ~(deviation > 0)
+    if np.any(wrong):
+        name = names[int(np.flatnonzero(np.any(wrong, axis=1))[0])]
+        raise ValueError(
+            f"ground: point {name!r} has a standard deviation that is not positive"
+        )
+    none = np.zeros(len(names), bool)
+    return Ground(names, at, deviation, none if check is None else np.asarray(check))
+
+
+def from_pairs(
+    left: Sequence[str],
+    right: Sequence[str],
+    pairs: Ragged,
+    points: Sequence[str],
+) -> MeasuredBlock:
+    """The block of oriented pairs: photo names `left` and `right` of each, the names of
+    the `points` of all rows.
+
+    A place that several pairs share is one measurement. Two places of a point on one
+    photo that differ are two measurements of it. Raises ValueError where a photo has
+    two focal lengths.
+    """
+    photos, both = np.unique(np.array([left, right]), return_inverse=True)
+    both = both.reshape(2, -1)
+    names, point = np.unique(np.asarray(points), return_inverse=True)
+    of_row = np.repeat(np.arange(len(pairs.lengths)), pairs.lengths)
+    used = np.flatnonzero(pairs.mask)
+    rows = lambda of_left, of_right: np.concatenate([of_left[used], of_right[used]])
+    photo = rows(both[0][of_row], both[1][of_row])
+    x, y = rows(pairs.x_left, pairs.x_right), rows(pairs.y_left, pairs.y_right)
+    sigma, point = rows(pairs.sigma, pairs.sigma), rows(point, point)
+    focal = _focals(photos, both, pairs)
+    unit = AGREE * focal[photo]
+    keys = np.stack([photo, point, np.round(x / unit), np.round(y / unit)])
+    _, first = np.unique(keys, axis=1, return_index=True)
+    first.sort()
+    return MeasuredBlock(
+        photos=tuple(str(name) for name in photos),
+        points=tuple(str(name) for name in names),
+        photo=photo[first],
+        point=point[first],
+        x=x[first],
+        y=y[first],
+        sigma=sigma[first],
+        focal=focal,
+    )
+
+
+def _focals(photos, both: Int[np.ndarray, "2 pair"], pairs: Ragged):
+    photo = both.reshape(-1)
+    focal = np.concatenate([pairs.focal_left, pairs.focal_right])
+    least, most = np.full(len(photos), np.inf), np.zeros(len(photos))
+    np.minimum.at(least, photo, focal)
+    np.maximum.at(most, photo, focal)
+    if np.any(wrong := least < most):
+        k = int(np.flatnonzero(wrong)[0])
+        raise ValueError(
+            f"from_pairs: photo {photos[k]!s} has the focal lengths {least[k]:g} and "
+            f"{most[k]:g} in different pairs"
+        )
+    return least

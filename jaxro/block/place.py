@@ -1,0 +1,138 @@
+"""A chained block on the ground, by three-point consensus.
+
+Three known points determine a similarity; the one that fits half of the known points
+best is taken. Known points that do not fit it at all have wrong coordinates, or the
+name of another point: after an adjustment, which bends the block to them, no test would
+name them.
+"""
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .chain import Chained, intersect
+from .measured_block import Ground, MeasuredBlock
+
+MOST_TRIPLES = 2000
+"""Triples of known points that are tried; of more points some at random."""
+
+FAR = 8.0
+"""Known points this many times farther from their neighbours' misfits than the median
+are named."""
+
+NEIGHBOURS = 6
+"""Known points that one is compared with."""
+
+
+class Similarity(NamedTuple):
+    """ground = shift + scale * rotation @ chained"""
+
+    rotation: Float[np.ndarray, "3 3"]
+    scale: float
+    shift: Float[np.ndarray, "3"]
+
+
+class Placed(NamedTuple):
+    """Where the block stands on the ground: the similarity, how far each known point is
+    from where it puts it (NaN: not compared), and those that do not fit (`wrong`)."""
+
+    similarity: Similarity
+    apart: Float[np.ndarray, " known"]
+    wrong: Bool[np.ndarray, " known"]
+
+
+class TooLittleControl(ValueError):
+    """Fewer than three known points, or all of them on one line."""
+
+
+def place(
+    block: MeasuredBlock, chained: Chained, ground: Ground, seed: int = 0
+) -> Placed:
+    """The similarity that takes a chained block to its known points. Raises
+    `TooLittleControl`."""
+    points = intersect(block, chained)
+    numbers = {name: k for k, name in enumerate(block.points)}
+    number = np.array([numbers.get(name, -1) for name in ground.points], int)
+    model = np.where((number >= 0)[:, None], points[np.maximum(number, 0)], np.nan)
+    at = np.where(ground.check[:, None], np.nan, ground.coordinates)
+    whole = np.flatnonzero(np.all(np.isfinite(model) & np.isfinite(at), axis=1))
+    if len(whole) < 3:
+        raise TooLittleControl(
+            f"{len(whole)} known points with three coordinates are on two photos or "
+            "more; three are needed to place a block"
+        )
+    triples = _triples(whole, seed)
+    rotation, scale, shift = _similarities(model[triples], at[triples])
+    moved = scale[:, None, None] * np.einsum("tij,kj->tki", rotation, model)
+    apart = moved + shift[:, None] - at[None]
+    known = np.any(np.isfinite(apart), axis=2)
+    distance = np.sqrt(np.nansum(apart**2, axis=2))
+    distance = np.where(known, distance, np.nan)
+    # half of the points, and no fewer than four: three fit anyway
+    of_half = np.sort(distance[:, whole], axis=1)
+    half = min(len(whole) - 1, max(3, len(whole) // 2))
+    middle = np.where(np.isfinite(of_half[:, half]), of_half[:, half], np.inf)
+    best = int(np.argmin(middle))
+    if not np.isfinite(middle[best]):
+        raise TooLittleControl("the known points lie on one line")
+    wrong = np.zeros(len(known[best]), bool)
+    if len(whole) > 4:
+        wrong[whole] = _stands_out(model[whole], apart[best, whole])
+    used = whole[~wrong[whole]]
+    all_ = _similarities(model[used][None], at[used][None])
+    found = Similarity(all_[0][0], float(all_[1][0]), all_[2][0])
+    fitted = found.shift + found.scale * model @ found.rotation.T - at
+    left = np.sqrt(np.nansum(fitted**2, axis=1))
+    return Placed(found, np.where(known[best], left, np.nan), wrong)
+
+
+def _stands_out(
+    model: Float[np.ndarray, "some 3"], apart: Float[np.ndarray, "some 3"]
+) -> Bool[np.ndarray, " some"]:
+    """Points whose misfit is not that of their neighbours: a long strip bends, and its
+    misfits change slowly along it."""
+    away = np.linalg.norm(model[:, None] - model[None], axis=2)
+    np.fill_diagonal(away, np.inf)
+    beside = np.argsort(away, axis=1)[:, :NEIGHBOURS]
+    of_others = np.median(apart[beside], axis=1)
+    left = np.linalg.norm(apart - of_others, axis=1)
+    return left > FAR * np.median(left)
+
+
+def on_ground(chained: Chained, similarity: Similarity) -> Chained:
+    """The chained photos in ground coordinates."""
+    rotation, scale, shift = similarity
+    return Chained(
+        chained.rotations @ rotation.T, shift + scale * chained.centres @ rotation.T
+    )
+
+
+def _triples(whole: np.ndarray, seed: int) -> np.ndarray:
+    """Three points each, all of them or some at random."""
+    n = len(whole)
+    if n * (n - 1) * (n - 2) // 6 <= MOST_TRIPLES:
+        return whole[np.array(list(combinations(range(n), 3)))]
+    rng = np.random.default_rng(seed)
+    keys = rng.random((MOST_TRIPLES, n))
+    return whole[np.argpartition(keys, 3, axis=1)[:, :3]]
+
+
+def _similarities(
+    model: Float[np.ndarray, "t k 3"], at: Float[np.ndarray, "t k 3"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotation, scale and shift of each set of points by least squares (Umeyama 1991);
+    NaN where they lie on one line."""
+    from_middle, to_middle = model.mean(axis=1), at.mean(axis=1)
+    a, b = model - from_middle[:, None], at - to_middle[:, None]
+    u, s, v = np.linalg.svd(np.einsum("tki,tkj->tij", b, a))
+    sign = np.sign(np.linalg.det(u @ v))
+    s[:, 2] *= sign
+    u[:, :, 2] *= sign[:, None]
+    rotation = u @ v
+    scale = np.sum(s, axis=1) / np.sum(a**2, axis=(1, 2))
+    # widths squared: a strip may be ten thousand times as long as it is wide
+    scale = np.where(s[:, 1] > 1e-9 * s[:, 0], scale, np.nan)
+    shift = to_middle - scale[:, None] * np.einsum("tij,tj->ti", rotation, from_middle)
+    return rotation, scale, shift

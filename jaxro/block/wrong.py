@@ -1,0 +1,184 @@
+"""Wrong places and wrong known coordinates of a block.
+
+First a redescending estimator brings the block near the truth, whatever a fifth of the
+ties says: each ray has the weight of Geman and McClure (1987), (c² / (c² + s²))², s its
+residual in standard deviations; c begins with what the residuals are and falls to
+`SURE`. Then the block is adjusted without the rays that are beyond `CLEAR`, and what
+is left is tested by its normalised residuals w (Baarda 1968), the largest one of each
+neighbourhood at a time.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..adjustment import critical_values
+from ..adjustment.sparse import Minimum, Problem, minimise, residuals_of
+from .adjust import BlockAdjustment, Prepared, conclude, prepare_block
+from .measured_block import Ground, MeasuredBlock
+from .network import Start
+
+SURE = 3.0
+"""The last scale c of the redescending weights, in standard deviations."""
+
+CLEAR = 6.0
+"""Residuals beyond so many standard deviations are wrong before any test."""
+
+ROUNDS = 12
+"""Rounds of redescending weights."""
+
+TESTS = 20
+"""Rounds of tests."""
+
+UNCHECKED = 0.02
+"""Redundancy below which nothing checks a coordinate: it is told, not tested."""
+
+
+class Wrong(NamedTuple):
+    """What was left out: rays, and known coordinates."""
+
+    rays: Bool[np.ndarray, " ray"]
+    control: Bool[np.ndarray, "known 3"]
+
+
+class Tested(NamedTuple):
+    """Normalised residuals of what takes part (NaN where nothing checks it), and the
+    limit that the largest of all exceeds by chance with the probability `level`."""
+
+    rays: Float[np.ndarray, "ray 2"]
+    control: Float[np.ndarray, "known 3"]
+    limit: float
+
+
+def adjust_without_wrong(
+    block: MeasuredBlock,
+    start: Start,
+    ground: Ground | None = None,
+    level: float = 0.05,
+) -> tuple[BlockAdjustment, Wrong]:
+    """Adjust a block without its wrong rays and known coordinates."""
+    prepared = prepare_block(block, start, ground)
+    found = settle(prepared)
+    wrong = _far(prepared, found)
+    adjusted = adjust_rest(block, prepared.start_at(found), ground, wrong)
+    for _ in range(TESTS):
+        more = _worst(adjusted, test(adjusted, level))
+        if not (np.any(more.rays) or np.any(more.control)):
+            break
+        wrong = Wrong(wrong.rays | more.rays, wrong.control | more.control)
+        adjusted = adjust_rest(block, adjusted.as_start, ground, wrong)
+    return adjusted, wrong
+
+
+def adjust_rest(
+    block: MeasuredBlock, start: Start, ground: Ground | None, wrong: Wrong
+) -> BlockAdjustment:
+    """The adjustment without what is wrong; rays and points keep their numbers."""
+    if ground is not None:
+        at = np.where(wrong.control, np.nan, ground.coordinates)
+        ground = ground._replace(coordinates=at)
+    prepared = prepare_block(block, start, ground, left_out=wrong.rays)
+    return conclude(prepared, minimise(prepared.problem, datum=prepared.datum))
+
+
+def test(adjusted: BlockAdjustment, level: float = 0.05) -> Tested:
+    """w = v / (sigma0 sigma √r) of all coordinates that something checks."""
+    normalise = lambda v, sigma, r: np.where(
+        r > UNCHECKED, v / (sigma * np.sqrt(np.maximum(r, UNCHECKED))), np.nan
+    )
+    unit = adjusted.sigma0 if adjusted.degrees_of_freedom > 0 else 1.0
+    sigma = adjusted.block.sigma[:, None] * unit
+    rays = normalise(adjusted.residuals, sigma, adjusted.redundancy)
+    control = np.zeros((0, 3))
+    if adjusted.ground is not None:
+        control = normalise(
+            adjusted.control_residuals,
+            adjusted.ground.sigma * unit,
+            adjusted.control_redundancy,
+        )
+    number = np.sum(np.isfinite(rays)) + np.sum(np.isfinite(control))
+    each = critical_values.sidak(level, max(int(number), 1))
+    return Tested(rays, control, float(critical_values.normal(each)))
+
+
+# -------------------------------------------------------------------------------------
+# redescending weights
+
+
+def settle(prepared: Prepared) -> Minimum:
+    """The minimum of a redescending loss, from afar."""
+    problem, datum = prepared.problem, prepared.datum
+    found = minimise(problem, datum=datum, max_steps=3)
+    scales = [np.inf] * len(problem.data.terms)
+    for _ in range(ROUNDS):
+        problem = problem.at(found.problem)
+        sizes = _sizes(problem)
+        scales = [_scale(s, c) for s, c in zip(sizes, scales, strict=True)]
+        weights = [
+            (c**2 / (c**2 + s**2)) ** 2 for s, c in zip(sizes, scales, strict=True)
+        ]
+        found = minimise(problem.weighted(weights), datum=datum, max_steps=2)
+    return found._replace(problem=problem.at(found.problem))
+
+
+def _sizes(problem: Problem) -> list[Float[np.ndarray, " group"]]:
+    """The residual of each group, in standard deviations of one coordinate."""
+    sizes = lambda r: np.sqrt(np.mean(r**2, axis=1))
+    return [sizes(r) for r in residuals_of(problem)]
+
+
+def _scale(sizes: Float[np.ndarray, " group"], before: float) -> float:
+    """The next scale: half of the one before, or what the residuals are."""
+    return max(SURE, min(before / 2, 3 * float(np.median(sizes))))
+
+
+# -------------------------------------------------------------------------------------
+# what is left out
+
+
+def _far(prepared: Prepared, found: Minimum) -> Wrong:
+    """What is beyond `CLEAR`."""
+    block, known, numbered = prepared.block, prepared.known, prepared.numbered
+    far = [sizes > CLEAR for sizes in _sizes(found.problem)]
+    rays = np.zeros(len(block.photo), bool)
+    rays[numbered.rays] = far[0]
+    control = np.zeros((_control_points(prepared.ground), 3), bool)
+    if len(far) > 1:
+        there = numbered.number[known.point] >= 0
+        control[known.row[there], known.axis[there]] = far[1]
+    return Wrong(rays, control)
+
+
+def _worst(adjusted: BlockAdjustment, tested: Tested) -> Wrong:
+    """The largest w beyond the limit: one ray of each point and each photo, and one
+    known point with all its coordinates, where this is larger than its rays are."""
+    block = adjusted.block
+    of_ray = np.max(np.nan_to_num(np.abs(tested.rays)), axis=1)
+    of_point = np.zeros(len(block.points))
+    np.maximum.at(of_point, block.point, of_ray)
+    rays = np.zeros(len(block.photo), bool)
+    control = np.zeros(tested.control.shape, bool)
+    free_points = np.ones(len(block.points), bool)
+    free_photos = np.ones(len(block.photos), bool)
+    if adjusted.ground is not None and len(tested.control) > 0:
+        of_known = np.max(np.nan_to_num(np.abs(tested.control)), axis=1)
+        worst = int(np.argmax(of_known))
+        name = adjusted.ground.points[worst]
+        number = block.points.index(name) if name in block.points else -1
+        beside = of_point[number] if number >= 0 else 0.0
+        if of_known[worst] > max(tested.limit, beside):
+            control[worst] = True
+            free_points[number] = False
+    for ray in np.argsort(-of_ray):
+        if of_ray[ray] <= tested.limit:
+            break
+        point, photo = block.point[ray], block.photo[ray]
+        if free_points[point] and free_photos[photo]:
+            rays[ray] = True
+            free_points[point] = free_photos[photo] = False
+    return Wrong(rays, control)
+
+
+def _control_points(ground: Ground | None) -> int:
+    return 0 if ground is None else len(ground.points)
