@@ -108,7 +108,7 @@ class Problem(NamedTuple):
         """The problem with the families of another one."""
         return self._replace(data=self.data._replace(families=other.data.families))
 
-    def weighted(self, weights: Sequence[Float[np.ndarray, " group"]]) -> "Problem":
+    def weighted(self, weights: Sequence[Float[np.ndarray, " _"]]) -> "Problem":
         """The problem with the variances of the groups of each term divided by
         weights."""
         terms = map(_weighted, self.data.terms, weights)

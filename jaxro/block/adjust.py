@@ -201,8 +201,11 @@ class Prepared(NamedTuple):
 def _start(
     units: Frame, numbered: Numbered, station: Station, points: np.ndarray
 ) -> Start:
-    outside = Station(station.quaternion, units.outside(station.centre))  # pyright: ignore[reportArgumentType]
-    return Start(outside, numbered.spread(units.outside(points)))
+    return Start(
+        quaternions=np.asarray(station.quaternion),
+        centres=units.outside(station.centre),
+        points=numbered.spread(units.outside(points)),
+    )
 
 
 def adjust_block(
@@ -231,12 +234,15 @@ def prepare_block(
     known = control_of(block, none if ground is None else ground)
     of_points = np.bincount(known.point, minlength=len(block.points))
     use = np.ones(len(block.photo), bool) if left_out is None else ~left_out
-    there = np.all(np.isfinite(np.asarray(start.points)), axis=1)
+    # a known point on one photo begins where it is known to be
+    points, at = start.points.copy(), (known.point, known.axis)
+    points[at] = np.where(np.isnan(points[at]), known.value, points[at])
+    there = np.all(np.isfinite(points), axis=1)
     numbered = number_points(block, of_points, use & there[block.point])
     terms = terms_of(block, numbered, known, units)
-    inside = units.inside(np.asarray(start.stations.centre))
-    stations = Station(np.asarray(start.stations.quaternion), inside)  # pyright: ignore[reportArgumentType]
-    points = units.inside(np.asarray(start.points)[numbered.number >= 0])
+    inside = jnp.asarray(units.inside(start.centres))
+    stations = Station(jnp.asarray(start.quaternions), inside)
+    points = units.inside(points[numbered.number >= 0])
     families = {"photo": stations, "point": points}
     problem = prepare(terms, families, eliminate="point", linked="photo")
     datum = inner_constraints(stations) if len(terms) == 1 else None

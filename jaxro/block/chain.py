@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..geometry.rotations import as_array
 from ..orientation.result import Orientation
 from .measured_block import MeasuredBlock
 
@@ -68,9 +67,12 @@ def models_of(
     oriented: Orientation,
 ) -> Models:
     """The usable ones of oriented pairs (an `Orientation` with a pair axis)."""
-    rotation, base = oriented.pose.relative()
-    r = np.asarray(as_array(rotation))
-    norm = np.sum(r[:, 0] ** 2, axis=1)[:, None, None]
+    from scipy.spatial.transform import Rotation
+
+    pose = oriented.pose
+    columns = lambda *parts: np.stack([np.asarray(a) for a in parts], axis=-1)
+    quaternions = columns(pose.qx, pose.qy, pose.qz, pose.qw)
+    base = columns(pose.bx, pose.by, pose.bz)
     turned = ALONG_Y_AND_Z
     axes = turned[:, None] * turned[None]
     variances = np.diagonal(np.asarray(oriented.cofactor), axis1=-2, axis2=-1)
@@ -78,8 +80,8 @@ def models_of(
     return Models(
         left=left[use],
         right=right[use],
-        rotation=(r / norm * axes)[use],
-        base=(np.stack([np.asarray(b) for b in base], axis=-1) * turned)[use],
+        rotation=Rotation.from_quat(quaternions[use]).as_matrix() * axes,
+        base=(base * turned)[use],
         deviation=np.sqrt(np.sum(variances[:, :3], axis=1))[use],
     )
 

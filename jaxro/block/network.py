@@ -24,9 +24,12 @@ FIXED = 1e-6
 
 
 class Start(NamedTuple):
-    """Approximate stations and points in ground coordinates."""
+    """Approximate values on the ground: quaternions of the rotations (w, x, y, z,
+    object to camera as in `calibration.camera`), projection centres, and points, NaN
+    for those that are not known."""
 
-    stations: Station
+    quaternions: Float[np.ndarray, "photo 4"]
+    centres: Float[np.ndarray, "photo 3"]
     points: Float[np.ndarray, "point 3"]
 
 
@@ -65,7 +68,7 @@ def of_station(station: Station, known: tuple[Array, Array]):
 
 def frame_of(start: Start) -> Frame:
     """The frame of a block: its middle, and the mean height above the points."""
-    centres, points = np.asarray(start.stations.centre), np.asarray(start.points)
+    _, centres, points = start
     middle = np.mean(centres, axis=0)
     there = np.all(np.isfinite(points), axis=1)
     apart = np.linalg.norm(points[there] - np.mean(points[there], axis=0), axis=1)

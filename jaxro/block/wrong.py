@@ -122,7 +122,7 @@ def settle(prepared: Prepared) -> Minimum:
     return found._replace(problem=problem.at(found.problem))
 
 
-def _sizes(problem: Problem) -> list[Float[np.ndarray, " group"]]:
+def _sizes(problem: Problem) -> list[Float[np.ndarray, " _"]]:
     """The residual of each group, in standard deviations of one coordinate."""
     sizes = lambda r: np.sqrt(np.mean(r**2, axis=1))
     return [sizes(r) for r in residuals_of(problem)]

@@ -1,0 +1,249 @@
+"""Strips and blocks: a published bundle, a dense adjustment in NumPy, simulation."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from jaxro import block
+from jaxro.adjustment import RESULTS
+from jaxro.batches.ragged import Ragged
+from jaxro.block.adjust import adjust_block
+from jaxro.block.chain import Chained
+from jaxro.block.measured_block import MeasuredBlock
+from jaxro.block.orient_block import orient_block, start_from
+from jaxro.block.wrong import test as normalised
+
+
+def read(file):
+    """The rows of a text table without its comments."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    rows = [line.split(",") for line in lines if line.strip() and line[0] != "#"]
+    return [[entry.strip() for entry in row] for row in rows]
+
+
+def all_pairs(measured, fewest=8):
+    """The pairs of all photos with common points."""
+    at = [
+        {measured.point[ray]: ray for ray in np.flatnonzero(measured.photo == k)}
+        for k in range(len(measured.photos))
+    ]
+    left, right, rows, begins = [], [], [], [0]
+    for i, j in itertools.combinations(range(len(at)), 2):
+        common = [point for point in at[i] if point in at[j]]
+        if len(common) >= fewest:
+            rows += [(at[i][point], at[j][point]) for point in common]
+            left.append(measured.photos[i])
+            right.append(measured.photos[j])
+            begins.append(len(rows))
+    one, other = np.array(rows).T
+    of_pairs = lambda focal: np.full(len(left), focal)
+    pairs = Ragged(
+        np.array(begins),
+        measured.x[one],
+        measured.y[one],
+        measured.x[other],
+        measured.y[other],
+        measured.sigma[one],
+        np.ones(len(one), bool),
+        of_pairs(measured.focal[0]),
+        of_pairs(measured.focal[0]),
+    )
+    return left, right, pairs, [measured.points[k] for k in measured.point[one]]
+
+
+@pytest.fixture(scope="module")
+def strasbourg(data):
+    """Five aerial photos with 381 points (Börlin and Grussenmeyer, DBAT), all places in
+    mm, control in metres about its middle; published stations with deviations."""
+    folder = data / "strasbourg_block"
+    rows = read(folder / "script_markpts.txt") + read(folder / "script_smartpts.txt")
+    names, point = np.unique([row[0] for row in rows], return_inverse=True)
+    pixels = np.array([row[2:4] for row in rows], float)
+    measured = MeasuredBlock(
+        photos=("8811", "8936", "8937", "8938", "9111"),
+        points=tuple(str(name) for name in names),
+        photo=np.array([int(row[1]) - 1 for row in rows]),
+        point=point,
+        x=pixels[:, 0] * 0.006 - 26.577,
+        y=38.811 - pixels[:, 1] * 0.006,
+        sigma=np.full(len(rows), 0.006),
+        focal=np.full(5, 123.939),
+    )
+    control = read(folder / "ctrlpts-weighted.txt")
+    at = np.array([row[2:5] for row in control], float)
+    known = block.ground(
+        [row[0] for row in control], at - at.mean(0), np.array([0.02, 0.02, 0.04])
+    )
+    published = np.genfromtxt(
+        folder / "published_eo.csv", delimiter=",", skip_header=1
+    )[:, 1:]
+    return measured, known, published
+
+
+def test_a_published_block(strasbourg):
+    """From its pairs alone, without start values. The published program has one point
+    with a single ray and shifts the control by an amount that is not published."""
+    measured, known, published = strasbourg
+    left, right, pairs, points = all_pairs(measured)
+    oriented = orient_block(left, right, pairs, points, known, more=measured)
+    found = oriented.adjusted
+    assert not np.any(oriented.placed.wrong)
+    # nothing is left out in the published adjustment
+    found = adjust_block(measured, found.as_start, known)
+    assert found.degrees_of_freedom == 1267
+    np.testing.assert_allclose(found.sigma0, 1.07447, atol=1e-5)
+    shift = found.centres - published[:, :3]
+    np.testing.assert_allclose(shift - shift.mean(0), 0, atol=1e-3)
+    np.testing.assert_allclose(np.degrees(found.angles), published[:, 3:6], atol=1e-4)
+    np.testing.assert_allclose(found.centre_deviations, published[:, 6:9], rtol=5e-3)
+    np.testing.assert_allclose(
+        np.degrees(found.angle_deviations), published[:, 9:12], rtol=5e-3
+    )
+    w = np.nanmax(np.abs(normalised(found).control), axis=1)
+    first = int(np.argmax(w))
+    assert known.points[first] == "410" and 4.5 < w[first] < 4.9
+
+
+def test_a_strip_is_that_of_a_dense_adjustment():
+    """Estimates, deviations and redundancy in NumPy, derivatives by differences."""
+    mock = block.mock_block(1, block.Flight(models=3))
+    measured, known = mock.block, mock.ground
+    start = start_from(measured, mock.photos)
+    found = adjust_block(measured, start, known)
+    q = dense_cofactor(found)
+    photos = len(measured.photos)
+    own = np.sqrt(np.diagonal(q)[: 6 * photos].reshape(photos, 6)[:, 3:])
+    np.testing.assert_allclose(found.centre_deviations, found.sigma0 * own, rtol=1e-5)
+    seen = found.numbered.number >= 0
+    own = np.sqrt(np.diagonal(q)[6 * photos :].reshape(-1, 3))
+    np.testing.assert_allclose(found.deviations[seen], found.sigma0 * own, rtol=1e-5)
+    white = found.residuals / measured.sigma[:, None]
+    of_control = found.control_residuals / known.sigma
+    squares = np.nansum(white**2) + np.nansum(of_control**2)
+    np.testing.assert_allclose(
+        found.sigma0, np.sqrt(squares / found.degrees_of_freedom), rtol=1e-9
+    )
+    redundancy = np.nansum(found.redundancy) + np.nansum(found.control_redundancy)
+    np.testing.assert_allclose(redundancy, found.degrees_of_freedom, rtol=1e-9)
+
+
+def dense_cofactor(found):
+    """(AᵀPA)⁻¹ of a linearisation by differences at the solution; small turns."""
+    measured, known = found.block, found.ground
+    number = found.numbered.number
+    photos, points = len(measured.photos), int(number.max()) + 1
+    w, x, y, z = np.asarray(found.stations.quaternion).T
+    turns = np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    ).transpose(2, 0, 1)
+    used = found.numbered.rays
+    photo, point = measured.photo[used], number[measured.point[used]]
+    ground = found.coordinates[number >= 0]
+    names = [name for name, k in zip(measured.points, number, strict=True) if k >= 0]
+    at_known = np.array([names.index(name) for name in known.points if name in names])
+
+    def values(step):
+        of_photos = step[: 6 * photos].reshape(photos, 6)
+        at = ground + step[6 * photos :].reshape(-1, 3)
+        apart = at[point] - found.centres[photo] - of_photos[photo, 3:]
+        inside = np.einsum("rij,rj->ri", turns[photo], apart)
+        inside = inside + np.cross(of_photos[photo, :3], inside)
+        place = inside[:, :2] / inside[:, 2:] * measured.focal[photo][:, None]
+        return np.concatenate(
+            [
+                (place / measured.sigma[used][:, None]).ravel(),
+                (at[at_known] / known.sigma[0, 0]).ravel(),
+            ]
+        )
+
+    count = 6 * photos + 3 * points
+    size = np.concatenate(
+        [np.tile([1e-6] * 3 + [1e-3] * 3, photos), [1e-3] * 3 * points]
+    )
+    steps = np.diag(size)
+    a = [(values(s) - values(-s)) / (2 * d) for s, d in zip(steps, size, strict=True)]
+    a = np.array(a).T
+    assert a.shape[1] == count
+    return np.linalg.inv(a.T @ a)
+
+
+@pytest.mark.parametrize("flight", [(1, 30), (3, 8)])
+def test_from_pairs_in_any_order_to_the_truth(flight):
+    """Strip and block: stations and points within their deviations."""
+    strips, models = flight
+    mock = block.mock_block(2, block.Flight(strips=strips, models=models))
+    left, right, pairs, points = block.pairs_of(mock.block, seed=5)
+    oriented = orient_block(left, right, pairs, points, mock.ground)
+    found = oriented.adjusted
+    place = [mock.block.photos.index(name) for name in found.block.photos]
+    z = (found.centres - mock.photos.centres[place]) / found.centre_deviations
+    assert np.max(np.abs(z)) < 4.5 and np.sqrt(np.mean(z**2)) < 1.8
+    assert 0.9 < found.sigma0 < 1.1
+    assert np.sum(oriented.wrong.rays) <= 2
+
+
+def test_wrong_ties_are_found():
+    """Every twentieth ray is wrong by millimetres."""
+    mock = block.mock_block(3, block.Flight(strips=3, models=8))
+    rng = np.random.default_rng(3)
+    bad = rng.random(len(mock.block.x)) < 0.05
+    moved = lambda a: np.where(bad, a + rng.uniform(-20, 20, len(a)), a)
+    measured = mock.block._replace(x=moved(mock.block.x), y=moved(mock.block.y))
+    start = start_from(measured, mock.photos)
+    found, wrong = block.adjust_without_wrong(measured, start, mock.ground)
+    assert 0.93 < found.sigma0 < 1.07
+    assert np.sum(wrong.rays & bad) > 0.9 * np.sum(bad)
+    z = (found.centres - mock.photos.centres) / found.centre_deviations
+    assert np.max(np.abs(z)) < 4.5
+
+
+def test_swapped_names_of_control_are_found_before_the_adjustment():
+    mock = block.mock_block(4, block.Flight(strips=2, models=10))
+    names = list(mock.ground.points)
+    names[1], names[6] = names[6], names[1]
+    swapped = mock.ground._replace(points=tuple(names))
+    placed = block.place(mock.block, mock.photos, swapped)
+    assert np.flatnonzero(placed.wrong).tolist() == [1, 6]
+
+
+def test_parts_without_a_common_scale_are_refused():
+    """Points in the middle of a strip are on two photos at most."""
+    mock = block.mock_block(5, block.Flight(models=10))
+    measured = mock.block
+    name = np.array([int(n.split("-")[1]) for n in measured.photos])
+    late = np.zeros(len(measured.points), bool)
+    late[measured.point[name[measured.photo] > 6]] = True
+    early = np.zeros(len(measured.points), bool)
+    early[measured.point[name[measured.photo] < 6]] = True
+    both = (late & early)[measured.point]
+    left, right, pairs, points = block.pairs_of(measured.without(both), fewest=5)
+    with pytest.raises(block.Unjoined, match="no scale joins the photos"):
+        orient_block(left, right, pairs, points, mock.ground)
+
+
+def test_control_on_a_line_and_too_little_of_it_are_refused():
+    mock = block.mock_block(6)
+    few = block.ground(mock.ground.points[:2], mock.ground.coordinates[:2], 0.02)
+    with pytest.raises(block.TooLittleControl, match="2 known points"):
+        block.place(mock.block, mock.photos, few)
+
+
+def test_a_free_network_has_the_inner_geometry_of_a_controlled_one():
+    """Without control: residuals of the rays of a block with minimal control."""
+    mock = block.mock_block(7, block.Flight(models=4))
+    chained = Chained(mock.photos.rotations, mock.photos.centres)
+    free = adjust_block(mock.block, start_from(mock.block, chained))
+    assert free.adjustment.result == RESULTS.successful
+    count = free.numbered.number.max() + 1
+    rays = int(np.sum(free.numbered.rays))
+    assert free.degrees_of_freedom == 2 * rays - 6 * 5 - 3 * count + 7
+    w = free.residuals / mock.block.sigma[:, None]
+    squares = np.nansum(w**2) / free.degrees_of_freedom
+    np.testing.assert_allclose(free.sigma0**2, squares, rtol=1e-9)
+    redundancy = np.nansum(free.redundancy)
+    np.testing.assert_allclose(redundancy, free.degrees_of_freedom, rtol=1e-7)
