@@ -23,7 +23,16 @@ def machine() -> str:
 
 
 def main() -> int:
-    from . import colmap, engine, first, photos, reading, rejection, scale
+    from . import (
+        calibration,
+        colmap,
+        engine,
+        first,
+        photos,
+        reading,
+        rejection,
+        scale,
+    )
     from .common import QUICK, Size
 
     suites = (
@@ -34,6 +43,7 @@ def main() -> int:
         | scale.SUITES
         | colmap.SUITES
         | photos.SUITES
+        | calibration.SUITES
     )
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)

@@ -75,8 +75,8 @@ class SparseAdjustment:
     `parameters`: by the name of their family. `residuals` (whitened) and `redundancy`:
     of each term. `cofactors`: of the local parameters of each member of the eliminated
     and of the linked family, and of all common ones together. `factored` solves for the
-    cofactors of anything else. Without a solution (`result`) the cofactors and
-    redundancies are empty.
+    cofactors of anything else. Without a solution (`result`) cofactors and
+    redundancies are NaN.
     """
 
     parameters: dict[str, Any]
@@ -334,12 +334,16 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
         name: jax.tree.map(lambda a, n=members[name]: np.asarray(a)[:n], family)
         for name, family in data.families.items()
     }
+    unknown = lambda name, d: np.full((members[name], d, d), np.nan)
     adjusted = SparseAdjustment(
         parameters=parameters,
         residuals=rows,
-        redundancy=[],
-        cofactors={},
-        common_cofactor=np.zeros((0, 0)),
+        redundancy=[np.full_like(r, np.nan) for r in rows],
+        cofactors={
+            roles.eliminated: unknown(roles.eliminated, roles.point_size),
+            roles.linked: unknown(roles.linked, roles.block_size),
+        },
+        common_cofactor=np.full((roles.common_total,) * 2, np.nan),
         sigma0=np.nan,
         degrees_of_freedom=used - unknowns,
         pivot=0.0,

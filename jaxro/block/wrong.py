@@ -1,9 +1,9 @@
 """Wrong places and wrong known coordinates of a block.
 
-First a redescending estimator brings the block near the truth, whatever a fifth of the
-ties says: each ray has the weight of Geman and McClure (1987), (c² / (c² + s²))², s its
-residual in standard deviations; c begins with what the residuals are and falls to
-`SURE`. Then the block is adjusted without the rays that are beyond `CLEAR`, and what
+First robust estimators bring the block near the truth, whatever a fifth of the ties
+says: the sum of absolute residuals, which has one minimum and needs no scale; then the
+redescending weights of Geman and McClure (1987), (c² / (c² + s²))², s the residual in
+standard deviations, with c that falls to `SURE`. Then the block is adjusted without the rays that are beyond `CLEAR`, and what
 is left is tested by its normalised residuals w (Baarda 1968), the largest one of each
 neighbourhood at a time.
 """
@@ -25,7 +25,10 @@ SURE = 3.0
 CLEAR = 6.0
 """Residuals beyond so many standard deviations are wrong before any test."""
 
-ROUNDS = 12
+ABSOLUTE = 10
+"""Rounds of weights 1 / s."""
+
+ROUNDS = 8
 """Rounds of redescending weights."""
 
 TESTS = 20
@@ -103,21 +106,23 @@ def test(adjusted: BlockAdjustment, level: float = 0.05) -> Tested:
 
 
 # -------------------------------------------------------------------------------------
-# redescending weights
+# robust estimators
 
 
 def settle(prepared: Prepared) -> Minimum:
-    """The minimum of a redescending loss, from afar."""
+    """The minimum of the robust estimators, one after the other, from afar."""
     problem, datum = prepared.problem, prepared.datum
     found = minimise(problem, datum=datum, max_steps=3)
     scales = [np.inf] * len(problem.data.terms)
-    for _ in range(ROUNDS):
+    for k in range(ABSOLUTE + ROUNDS):
         problem = problem.at(found.problem)
         sizes = _sizes(problem)
-        scales = [_scale(s, c) for s, c in zip(sizes, scales, strict=True)]
-        weights = [
-            (c**2 / (c**2 + s**2)) ** 2 for s, c in zip(sizes, scales, strict=True)
-        ]
+        if k < ABSOLUTE:
+            weights = [1 / np.maximum(s, 1.0) for s in sizes]
+        else:
+            scales = [_scale(s, c) for s, c in zip(sizes, scales, strict=True)]
+            both = zip(sizes, scales, strict=True)
+            weights = [(c**2 / (c**2 + s**2)) ** 2 for s, c in both]
         found = minimise(problem.weighted(weights), datum=datum, max_steps=2)
     return found._replace(problem=problem.at(found.problem))
 
