@@ -3,9 +3,9 @@
 First robust estimators bring the block near the truth, whatever a fifth of the ties
 says: the sum of absolute residuals, which has one minimum and needs no scale; then the
 redescending weights of Geman and McClure (1987), (c² / (c² + s²))², s the residual in
-standard deviations, with c that falls to `SURE`. Then the block is adjusted without the rays that are beyond `CLEAR`, and what
-is left is tested by its normalised residuals w (Baarda 1968), the largest one of each
-neighbourhood at a time.
+standard deviations, with c that falls to `SURE`. Then the block is adjusted without the
+rays that are beyond `CLEAR`, and what is left is tested by its normalised residuals w
+(Baarda 1968), the largest one of each neighbourhood at a time.
 """
 
 from typing import NamedTuple
