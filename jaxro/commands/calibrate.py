@@ -34,6 +34,7 @@ from ..xla import programs
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .calibration_request import Options, Task, prepare
+from .calibration_tests import Alone, compare_distortions, tested_zones
 from .corrected import Wanted, corrected_texts, read_wanted
 
 LEAST_ROOM = 32
@@ -112,6 +113,7 @@ def calibrate(options: Options, task: Task, told: Callable[..., None]) -> Done:
         "sigma_known": task.sigma_known,
         "named": named,
         "together": task.together,
+        "known_has_deviations": any((options.principal_sigma, options.focal_sigma)),
     }
     if task.together:
         photos, compared, points = calibrate_several(options, task)
@@ -128,21 +130,29 @@ def calibrate(options: Options, task: Task, told: Callable[..., None]) -> Done:
             photos=[one], variants={}, chosen=False, distances=told_by, **common
         )
     else:
-        photos, compared = [], {}
+        images, compared = [], {}
         for image, name in enumerate(named.images):
             one, rows = calibrate_alone(options, task, image)
-            photos.append(one)
+            images.append(one)
             compared[name] = rows
             told(image + 1)
-        chosen = any(len(rows) > 1 for rows in compared.values())
-        done = Done(photos=photos, variants=compared, chosen=chosen, **common)
+        with say_what("Comparing distortions ..."):
+            differences = compare_distortions(task, images)
+        done = Done(
+            photos=[one.photo for one in images],
+            variants=compared,
+            chosen=len(task.models) > 1,
+            differences=differences,
+            **common,
+        )
     check_support(done)
-    return done
+    zones = {} if task.together else tested_zones(done.photos, task.known)
+    return replace(done, zones=zones)
 
 
 def calibrate_alone(
     options: Options, task: Task, image: int
-) -> tuple[Photo, list[Variant]]:
+) -> tuple[Alone, list[Variant]]:
     """One image by the model that it needs."""
     rows = task.named.rows_of(image)
     measured = one_image(task, rows, options.y_down, room=_room(task.named))
@@ -150,7 +160,8 @@ def calibrate_alone(
     with say_what("Comparing models ..."):
         found, compared = calibration.choose(measured, task.models, task.known)
     sigma = float(np.sqrt(np.mean(task.sigma[rows] ** 2)))
-    return _photo(task, image, found), variants(compared, sigma)
+    one = Alone(_photo(task, image, found), compared)
+    return one, variants(compared, sigma)
 
 
 def _photo(task: Task, image: int, found: Calibration) -> Photo:
@@ -212,11 +223,14 @@ def calibrate_several(
     model, *others = task.models
     with say_what("Calibrating all images together ..."):
         if others:
-            found, compared = calibration.choose_together(measured, task.models)
+            found, compared = calibration.choose_together(
+                measured, task.models, task.known
+            )
             mean = float(np.sqrt(np.mean(task.sigma**2)))
             tried = {"all images": variants(compared, mean)}
         else:
-            found, tried = calibration.calibrate_together(measured, model), {}
+            found = calibration.calibrate_together(measured, model, task.known)
+            tried = {}
     one = Program(of_image_number, {}, COMPILE_FAST)
     photos = [
         _photo(task, k, one((found, jnp.asarray(k)))) for k in range(len(named.images))

@@ -63,7 +63,8 @@ Fisheye = Annotated[
 PrincipalPoint = Annotated[
     tuple[float, float] | None,
     typer.Option(
-        help="What is known of the principal place, in the measuring system.",
+        help="What is known of the principal place, in the measuring system; of every "
+        "camera.",
         metavar="X Y",
         show_default=False,
     ),
@@ -79,7 +80,8 @@ PrincipalSigma = Annotated[
 Focal = Annotated[
     float | None,
     typer.Option(
-        help="What is known of the focal length, in the unit of the image.",
+        help="What is known of the focal length, in the unit of the image; of every "
+        "camera.",
         metavar="F",
         show_default=False,
     ),
@@ -131,6 +133,23 @@ Separately = Annotated[
         help="Each image alone, by the model that it needs; all points are known.",
     ),
 ]
+Differences = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--difference",
+        help="Two images, as often as wanted: whether their distortion is the same, "
+        "in one measuring system of one camera. With --separately.",
+        metavar="LEFT,RIGHT",
+        show_default=False,
+    ),
+]
+Refocused = Annotated[
+    bool,
+    typer.Option(
+        "--refocused",
+        help="With --difference: the focal length may have changed.",
+    ),
+]
 Correct = Annotated[
     Path | None,
     typer.Option(
@@ -159,7 +178,7 @@ Out = Annotated[
         "--out",
         "-o",
         help="Folder for cameras.csv, stations.csv, zones.csv, corrections.csv, "
-        "residuals.csv, points.csv, variants.csv and pictures.",
+        "residuals.csv, points.csv, variants.csv, difference.csv and pictures.",
         metavar="DIR",
         show_default=False,
     ),
@@ -183,6 +202,8 @@ def calibrate(
     distances: ByDistances = False,
     own_cameras: OwnCameras = False,
     separately: Separately = False,
+    difference: Differences = None,
+    refocused: Refocused = False,
     correct: Correct = None,
     pair: Pairs = None,
     unit: Unit = "px",
@@ -214,6 +235,8 @@ def calibrate(
         distances=distances,
         own_cameras=own_cameras,
         separately=separately,
+        differences=tuple(difference or ()),
+        refocused=refocused,
         correct=correct,
         pairs=tuple(pair or ()),
         unit=unit,

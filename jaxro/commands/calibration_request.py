@@ -35,6 +35,8 @@ class Options:
     distances: bool = False
     own_cameras: bool = False
     separately: bool = False
+    differences: tuple[str, ...] = ()
+    refocused: bool = False
     correct: Path | None = None
     pairs: tuple[str, ...] = ()
     unit: str = "px"
@@ -44,7 +46,9 @@ class Options:
 
 @dataclass(frozen=True)
 class Task:
-    """What is calibrated, read and checked; `models`: to choose among."""
+    """What is calibrated, read and checked. `models`: to choose among. `differences`:
+    the images whose distortions are compared, two by two; `refocused`: whether a change
+    of the focal length is taken out of them."""
 
     title: str
     named: NamedImages
@@ -53,6 +57,8 @@ class Task:
     models: tuple[Model, ...]
     known: Known
     together: bool
+    differences: list[tuple[str, str]]
+    refocused: bool
 
 
 def prepare(options: Options) -> Task:
@@ -70,13 +76,6 @@ def prepare(options: Options) -> Task:
         tables.check_seen(named)
     else:
         tables.check_known(named, other)
-    if together and (options.principal_point or options.focal):
-        option = "--focal" if options.principal_point is None else "--principal-point"
-        raise TableError(
-            option,
-            found="it for several images together",
-            expected="--separately beside it, or one image",
-        )
     if not named.is_single and options.distances:
         raise TableError(
             "--distances",
@@ -110,6 +109,8 @@ def prepare(options: Options) -> Task:
         models=models,
         known=_known(options),
         together=together,
+        differences=_differences(options, named, together),
+        refocused=options.refocused,
     )
 
 
@@ -145,6 +146,10 @@ def check_options(options: Options) -> None:
             found=f"it with --model {options.model}",
             expected="focal lengths alone: one-f, two-f, --zones",
         )
+    if options.refocused and not options.differences:
+        raise TableError(
+            "--refocused", found="it alone", expected="--difference LEFT,RIGHT with it"
+        )
     for name, value in (("--correct", options.correct), ("--pair", options.pairs)):
         if value and options.out is None:
             raise TableError(name, found="it without --out", expected="--out DIR")
@@ -177,6 +182,40 @@ def _read(options: Options) -> tuple[str, NamedImages, str]:
     known = tables.read_points(options.object, options.semicolons)
     named = tables.assemble(measured, known)
     return str(options.file), named, str(options.object)
+
+
+def _differences(
+    options: Options, named: NamedImages, together: bool
+) -> list[tuple[str, str]]:
+    """The images of --difference, two by two. Raises TableError."""
+    pairs = [two_images("--difference", text, named) for text in options.differences]
+    if pairs and together:
+        raise TableError(
+            "--difference",
+            found="it for images that are calibrated together",
+            expected="--separately beside it: two calibrations that have nothing in "
+            "common",
+        )
+    return pairs
+
+
+def two_images(option: str, text: str, named: NamedImages) -> tuple[str, str]:
+    """LEFT,RIGHT. Raises TableError."""
+    if named.is_single:
+        raise TableError(
+            option,
+            found=f"{text!r} for one image",
+            expected="a table with several images, told apart by a column image",
+        )
+    left, _, right = (part.strip() for part in text.partition(","))
+    if left == right or not {left, right} <= set(named.images):
+        raise TableError(
+            option,
+            found=repr(text),
+            expected=f"LEFT,RIGHT, two images of {named.file}: "
+            f"{', '.join(named.images)}",
+        )
+    return left, right
 
 
 def _known(options: Options) -> Known:

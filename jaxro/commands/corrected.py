@@ -13,7 +13,7 @@ from ..tables import images as tables
 from ..tables.fields import TableError
 from ..tables.images import NamedImages
 from ..tables.survey_checks import Row
-from .calibration_request import Options
+from .calibration_request import Options, two_images
 
 FEWEST = 5
 """Points in common without which a pair cannot be oriented."""
@@ -73,15 +73,8 @@ def read_wanted(options: Options, named: NamedImages) -> Wanted | None:
 
 
 def _pair(text: str, rows: list[Row], named: NamedImages) -> tuple[str, str]:
-    """LEFT,RIGHT. Raises TableError."""
-    left, _, right = (part.strip() for part in text.partition(","))
-    if left == right or not {left, right} <= set(named.images):
-        raise TableError(
-            "--pair",
-            found=repr(text),
-            expected=f"LEFT,RIGHT, two images of {named.file}: "
-            f"{', '.join(named.images)}",
-        )
+    """LEFT,RIGHT with points in common. Raises TableError."""
+    left, right = two_images("--pair", text, named)
     points = [
         {row.cells["point"] for row in rows if row.cells["image"] == side}
         for side in (left, right)

@@ -17,8 +17,14 @@ from .calibration_model import (
     lens_names,
     zone_names,
 )
-from .calibration_words import accuracy, advice, decision, sentences
-from .pair import digits, left_out, table, worst
+from .calibration_test_words import difference_in_words, zones_in_words
+from .calibration_words import (
+    accuracy,
+    advice,
+    decision,
+    sentences,
+)
+from .pair import digits, join_names, left_out, table, worst
 from .text import number
 
 AXES = ("X", "Y", "Z")
@@ -26,6 +32,9 @@ ANGLES = ("omega", "phi", "kappa")
 
 LARGEST = 8
 """Residuals that are shown."""
+
+SHOWN = 10
+"""Names of images that are shown in a line."""
 
 TRIED = 12
 """Variants that are shown."""
@@ -38,6 +47,7 @@ def show(console: Console, done: Done) -> None:
         _verdict(console, done, done.photos[0])
     else:
         _verdict_of_many(console, done)
+    _tests(console, done)
     if done.cameras:
         _stations(console, done)
         _cameras(console, done)
@@ -92,10 +102,10 @@ def _verdict_of_many(console: Console, done: Done) -> None:
     if done.together and failed:
         console.print(f"[bold red]{failed[0].result}[/bold red]: {advice(failed[0])}")
         return
-    for one in failed:
-        console.print(
-            f"[bold red]{escape(one.name)}: {one.result}[/bold red]: {advice(one)}"
-        )
+    for result in dict.fromkeys(one.result for one in failed):
+        alike = [one for one in failed if one.result == result]
+        names = join_names([one.name for one in alike], SHOWN)
+        console.print(f"[bold red]{names}: {result}[/bold red]: {advice(alike[0])}")
     if done.together:
         console.print(f"[green]{decision(done, done.photos[0])}[/green]")
         console.print(accuracy(done, done.photos[0]), markup=False)
@@ -108,6 +118,20 @@ def _verdict_of_many(console: Console, done: Done) -> None:
             )
 
 
+def _tests(console: Console, done: Done) -> None:
+    """Whether zones differ, and distortions."""
+    usable = [one for one in done.photos if one.usable]
+    for one in usable[:1] if done.together else usable:
+        if said := zones_in_words(done, one):
+            of = f"{one.name}: " if len(done.photos) > 1 and not done.together else ""
+            console.print(f"{of}{said}", markup=False)
+    for both in done.differences:
+        verdict, *rest = difference_in_words(done, both)
+        console.print(f"[green]{escape(verdict)}[/green]")
+        for text in rest:
+            console.print(text, markup=False)
+
+
 # -------------------------------------------------------------------------------------
 # tables
 
@@ -118,13 +142,17 @@ def _stations(console: Console, done: Done) -> None:
     if len(done.photos) == 1:
         console.print(_station(shown[0]))
         return
-    heads = [head for name in (*AXES, *ANGLES) for head in (name, "±")]
-    title = "Stations in the unit of the object; angles in degrees, object to photo"
-    rows = table("image", *heads, title=title)
-    for one in worst(shown, lambda one: -float(np.max(one.figures.centre_deviations))):
-        values, deviations = _numbers_of_station(one)
-        rows.add_row(escape(one.name), *_cells(values, deviations))
-    console.print(rows)
+    kept = worst(shown, lambda one: -float(np.max(one.figures.centre_deviations)))
+    for names, part, title in (
+        (AXES, slice(0, 3), "Stations in the unit of the object"),
+        (ANGLES, slice(3, 6), "Angles in degrees, object to photo"),
+    ):
+        heads = [head for name in names for head in (name, "±")]
+        rows = table("image", *heads, title=title)
+        for one in kept:
+            values, deviations = _numbers_of_station(one)
+            rows.add_row(escape(one.name), *_cells(values[part], deviations[part]))
+        console.print(rows)
     left_out(console, len(shown), "images, those with the weakest stations shown")
 
 

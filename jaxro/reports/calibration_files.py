@@ -16,6 +16,7 @@ from .calibration_model import (
     describe,
     zone_names,
 )
+from .calibration_tests import Compared
 
 AXES = ("X", "Y", "Z")
 ANGLES = ("omega", "phi", "kappa")
@@ -26,7 +27,9 @@ Row = dict[str, Any]
 def contents(done: Done) -> dict[str, str]:
     """The tables by name."""
     tables: dict[str, list[Row]] = {
-        "cameras.csv": [_camera(done, one) for one in done.photos],
+        "cameras.csv": [
+            _camera(done, one) | _zone_test(done, one) for one in done.photos
+        ],
         "stations.csv": [_station(one) for one in done.photos],
         "zones.csv": [row for one in done.cameras for row in _zones(one)],
         "residuals.csv": [row for one in done.photos for row in _residuals(done, one)],
@@ -35,6 +38,8 @@ def contents(done: Done) -> dict[str, str]:
         ],
         "corrections.csv": [row for one in done.maps for row in _corrections(one)],
         "points.csv": _points(done),
+        "difference.csv": [row for one in done.differences for row in _map(one)],
+        "difference_tests.csv": [_difference(one) for one in done.differences],
         "distances.csv": [] if done.distances is None else _distances(done.distances),
     }
     return {name: _text(rows) for name, rows in tables.items() if rows}
@@ -73,6 +78,69 @@ def _camera(done: Done, one: Photo) -> Row:
         "field_parameters": number(float(figures.in_field)),
         "expected_error": None if done.together else number(one.expected_error),
     }
+
+
+def _zone_test(done: Done, one: Photo) -> Row:
+    """Whether the zones of an image differ."""
+    tested = done.zones.get(one.name)
+    if tested is None or not np.isfinite(tested.probability):
+        return dict.fromkeys(("zones_F", "zones_above", "zones_below", "zones_p"))
+    return {
+        "zones_F": tested.f,
+        "zones_above": tested.above,
+        "zones_below": tested.below,
+        "zones_p": tested.probability,
+    }
+
+
+def _difference(one: Compared) -> Row:
+    """The test of two distortions, and what was taken out of their difference."""
+    found = one.found
+    value = lambda read: None if found is None else read(found)
+    turns = {
+        f"turn_{axis}_deg": value(lambda d, k=k: float(np.degrees(d.turn[k])))
+        for k, axis in enumerate("xyz")
+    }
+    shifts = {
+        f"shift_{axis}": value(lambda d, k=k: float(d.shift[k]))
+        for k, axis in enumerate("xy")
+    }
+    return {
+        "first": one.first,
+        "second": one.second,
+        "model": describe(one.model),
+        "refocused": one.refocused,
+        "F": value(lambda d: d.f),
+        "above": value(lambda d: d.above),
+        "below": value(lambda d: d.below),
+        "p": value(lambda d: d.probability),
+        **turns,
+        **shifts,
+        "scale": value(lambda d: d.scale) if one.refocused else None,
+    }
+
+
+def _map(one: Compared) -> list[Row]:
+    """The difference of two distortions on the nodes."""
+    found = one.found
+    if found is None:
+        return []
+    return [
+        {
+            "first": one.first,
+            "second": one.second,
+            "x": float(found.places[k, 0]),
+            "y": float(found.places[k, 1]),
+            "dx": float(found.difference[k, 0]),
+            "dy": float(found.difference[k, 1]),
+            "s_dx": float(found.deviations[k, 0]),
+            "s_dy": float(found.deviations[k, 1]),
+            "wx": float(found.in_deviations[k, 0]),
+            "wy": float(found.in_deviations[k, 1]),
+            "inside": bool(one.inside[k]),
+        }
+        for k in range(len(found.places))
+    ]
 
 
 def _station(one: Photo) -> Row:

@@ -23,6 +23,7 @@ from ..calibration.zones import AbstractZones
 from ..tables.images import NamedImages
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
+from .calibration_tests import Compared, TestedZones
 
 RESULT_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
 """Names of the results by their number."""
@@ -248,7 +249,9 @@ class ObjectPoints:
 class Done:
     """All that a call of `jaxro calibrate` found. `variants`: of each image that was
     calibrated alone, or of all images together. `chosen`: whether the evidence chose
-    the model."""
+    the model. `zones`: the tests of images with zones. `differences`: pairs of images
+    whose distortions were compared. `known_has_deviations`: whether a principal place
+    or focal length was given with a standard deviation."""
 
     title: str
     unit: str
@@ -261,6 +264,9 @@ class Done:
     maps: list[Map] = field(default_factory=list)
     points: ObjectPoints | None = None
     distances: Distances | None = None
+    known_has_deviations: bool = False
+    zones: dict[str, TestedZones] = field(default_factory=dict)
+    differences: list[Compared] = field(default_factory=list)
 
     @property
     def cameras(self) -> list[Photo]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from .calibration_model import NODES, Done, Map, Photo, Variant, describe
+from .calibration_tests import Compared
 
 COLOURS = "viridis"
 MOST = 6
@@ -21,8 +22,10 @@ TRIED = 15
 
 def pictures(done: Done) -> dict[str, bytes]:
     """The pictures by their names: corrections with their standard deviations,
-    residuals, variants."""
+    residuals, variants, differences of two images."""
     found = {}
+    if any(one.found is not None for one in done.differences):
+        found["difference.png"] = draw_differences(done)
     if done.maps:
         found["corrections.png"] = draw_corrections(done)
         found["residuals.png"] = draw_residuals(done)
@@ -75,6 +78,36 @@ def draw_residuals(done: Done) -> bytes:
     return _png(figure)
 
 
+def draw_differences(done: Done) -> bytes:
+    """The difference of both distortions of each pair as arrows among the places that
+    both have measured; their colour is the difference in standard deviations."""
+    pairs = [one for one in done.differences if one.found is not None][:MOST]
+    figure = _figure(7.0, 5.2 * len(pairs))
+    down = {one.name: bool(one.figures.y_down) for one in done.photos}
+    every = figure.subplots(len(pairs), 1, squeeze=False).ravel()
+    for axes, one in zip(every, pairs, strict=True):
+        _draw_difference(axes, done, one)
+        _set_axes(axes, done.unit, down[one.first])
+    return _png(figure)
+
+
+def _draw_difference(axes: Any, done: Done, one: Compared) -> None:
+    found = one.found
+    assert found is not None
+    shown = one.counts
+    title = f"{one.second} minus {one.first}"
+    drawn = _arrows(
+        axes,
+        found.places[shown],
+        found.difference[shown],
+        done.unit,
+        title,
+        one.in_deviations[shown],
+    )
+    label = "length in standard deviations"
+    axes.figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
+
+
 def draw_variants(done: Done, rows: list[Variant]) -> bytes:
     """The score of each model behind the best one, and the error of coordinates left
     out."""
@@ -108,18 +141,26 @@ def _png(figure: Any) -> bytes:
 
 
 def _arrows(
-    axes: Any, places: np.ndarray, shifts: np.ndarray, unit: str, title: str
-) -> None:
+    axes: Any,
+    places: np.ndarray,
+    shifts: np.ndarray,
+    unit: str,
+    title: str,
+    colours: np.ndarray | None = None,
+) -> Any:
     """Arrows at places, enlarged so that the longest one is seen; the title says how
     long it is."""
     longest = float(np.max(np.hypot(*shifts.T), initial=0.0))
     side = float(np.max(np.ptp(places, axis=0), initial=0.0)) or 1.0
     scale = longest / (ARROW * side) if longest > 0 else 1.0
-    axes.quiver(
-        *places.T, *shifts.T, angles="xy", scale_units="xy", scale=scale, width=0.004
-    )
-    axes.plot(*places.T, ".", color="tab:blue", markersize=3)
+    how = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.004}
+    if colours is None:
+        drawn = axes.quiver(*places.T, *shifts.T, **how)
+        axes.plot(*places.T, ".", color="tab:blue", markersize=3)
+    else:
+        drawn = axes.quiver(*places.T, *shifts.T, colours, cmap=COLOURS, **how)
     axes.set_title(f"{title}, the longest {longest:.3g} {unit}")
+    return drawn
 
 
 def _mark_worst(axes: Any, done: Done, one: Photo) -> None:

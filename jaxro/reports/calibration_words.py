@@ -6,6 +6,7 @@ import numpy as np
 from ..adjustment import critical_values as critical
 from ..calibration.results import RESULTS
 from .calibration_model import Done, Photo, describe, lens_names
+from .calibration_test_words import mind_difference
 from .pair import digits, join_names
 from .reliability import DOUBTFUL
 from .text import number
@@ -16,9 +17,13 @@ FEW = 15
 POORLY = 0.1
 """Redundancy below which a coordinate is said to be poorly checked."""
 
+MOST = 6
+"""Sentences of a kind that are shown."""
+
 OPTIONS = {
     "plane_object": "Options: --principal-point X Y --principal-sigma S, or --focal F "
-    "--focal-sigma S.",
+    "--focal-sigma S; both of them for models that stretch or shear the image (two-f, "
+    "brown).",
     "weakly_determined": "Options: --model one-f, or --principal-point X Y "
     "--principal-sigma S.",
     "diverged": "Try --y-up or --y-down, --model one-f, and look for exchanged points.",
@@ -76,12 +81,17 @@ def accuracy(done: Done, one: Photo) -> str:
     unit = "" if done.sigma_known else f" {done.unit}"
     text = f"sigma0 {value}{unit}, {freedom} degree{plural} of freedom"
     if done.sigma_known and freedom > 0:
-        text += f", probability beside 1: {chance(sigma0, freedom):.2g}"
+        text += f", probability beside 1: {_small(chance(sigma0, freedom))}"
     return text
 
 
 def chance(sigma0: float, freedom: int) -> float:
+    """The probability that sigma0 differs as much from 1 by chance."""
     return float(critical.global_p(freedom * sigma0**2, freedom))
+
+
+def _small(probability: float) -> str:
+    return f"{probability:.2g}" if probability > 1e-99 else "below 1e-99"
 
 
 # -------------------------------------------------------------------------------------
@@ -90,18 +100,41 @@ def chance(sigma0: float, freedom: int) -> float:
 
 def sentences(done: Done) -> list[str]:
     """What a careful user should know of the result."""
-    said = []
     usable = [one for one in done.photos if one.usable]
-    for one in usable if not done.together else usable[:1]:
-        said += [_of(done, one) + text for text in _of_fit(done, one)]
-    for one in usable:
-        said += [_of(done, one, True) + text for text in _of_points(done, one)]
-    if done.named.has_deviations and not done.sigma_known:
+    of_fit = [
+        _of(done, one) + text
+        for one in (usable[:1] if done.together else usable)
+        for text in _of_fit(done, one)
+    ]
+    of_points = [
+        _of(done, one, True) + text
+        for one in sorted(usable, key=lambda one: -_excess(done, one))
+        for text in _of_points(done, one)
+    ]
+    said = [
+        *_first(of_fit, "cameras.csv of --out has sigma0 of every image"),
+        *_first(of_points, "residuals.csv of --out has all"),
+    ]
+    for one in done.differences:
+        said += [f"{one.names}: {text}" for text in mind_difference(done, one)]
+    if done.sigma_known:
+        return said
+    weighed = {
+        "object points": done.named.has_deviations,
+        "known numbers of the camera": done.known_has_deviations,
+    }
+    for what in (name for name, has in weighed.items() if has):
         said.append(
-            "The object points have standard deviations and the places have none: they "
-            f"are taken to be 1 {done.unit}. Give --sigma."
+            f"The {what} have standard deviations and the places have none: they are "
+            f"taken to be 1 {done.unit}. Give --sigma."
         )
     return said
+
+
+def _first(said: list[str], where: str) -> list[str]:
+    """The first sentences, and where the others are found."""
+    more = len(said) - MOST
+    return said[:MOST] + ([f"{more} more like these: {where}."] if more > 0 else [])
 
 
 def _of(done: Done, one: Photo, always: bool = False) -> str:
@@ -113,17 +146,17 @@ def _of_fit(done: Done, one: Photo) -> list[str]:
     sigma0, freedom = float(one.figures.sigma0), int(one.figures.degrees_of_freedom)
     said = []
     if done.sigma_known and freedom > 0 and chance(sigma0, freedom) < DOUBTFUL:
-        probability = chance(sigma0, freedom)
+        probability = _small(chance(sigma0, freedom))
         if sigma0 > 1:
             said.append(
                 f"The coordinates are {sigma0:.1f} times less accurate than their sigma "
-                f"says (probability {probability:.1g}): sigma is too small, points are "
+                f"says (probability {probability}): sigma is too small, points are "
                 "wrong, or the image needs another model."
             )
         else:
             said.append(
                 f"The coordinates are {1 / sigma0:.1f} times more accurate than their "
-                f"sigma says (probability {probability:.1g}): sigma is too large."
+                f"sigma says (probability {probability}): sigma is too large."
             )
     if freedom < FEW:
         said.append(
@@ -131,6 +164,11 @@ def _of_fit(done: Done, one: Photo) -> list[str]:
             "choice among models. Measure more points."
         )
     return said
+
+
+def _excess(done: Done, one: Photo) -> float:
+    """The largest residual of an image over its limit."""
+    return float(np.max(np.abs(done.w(one)))) / done.limit(one)
 
 
 def _of_points(done: Done, one: Photo) -> list[str]:

@@ -1,60 +1,25 @@
 """`jaxro calibrate` as its user meets it: reports, files, bad input, and the road from
 raw coordinates of two non-metric photos to a model of the object."""
 
-import csv
 import re
 
 import numpy as np
 import pytest
 from bad_tables import write
-from oracles_calibration import rotation
-from typer.testing import CliRunner
+from calibrate_command import (
+    SIGMA,
+    names_of,
+    numbers,
+    one_image,
+    rows,
+    run,
+    table,
+    taken,
+    words,
+)
 
 from jaxro import calibration
-from jaxro.cli import app
 from jaxro.tables.examples import calibration as example
-
-SIGMA = 0.006
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
-    assert result.exception is None or isinstance(result.exception, SystemExit), (
-        result.exception
-    )
-    return result
-
-
-def words(text):
-    return " ".join(text.split())
-
-
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def numbers(table, *columns):
-    return np.array([[float(row[c]) for c in columns] for row in table])
-
-
-def table(header, *columns):
-    """CSV text of columns of names and of numbers."""
-    lines = [header]
-    for row in zip(*columns, strict=True):
-        lines.append(",".join(c if isinstance(c, str) else f"{c:.5f}" for c in row))
-    return "\n".join(lines) + "\n"
-
-
-def taken(rng, points, station, angles, film=0.0, y=-1.0, noise=SIGMA):
-    """Places in mm of a photo with f = 60 mm, its principal place at (100, 50), y
-    downwards; `film`: its largest displacement."""
-    seen = (points - station) @ rotation(*angles).T
-    ideal = -60 * seen[:, :2] / seen[:, 2:]
-    u = ideal / 30
-    apart = [np.sin(u[:, 0] + 0.3) * np.cos(u[:, 1]), -np.sin(u[:, 1] - 0.4)]
-    places = ideal + film * np.stack(apart, axis=1)
-    return places * [1.0, y] + [100.0, 50.0] + rng.normal(0, noise, places.shape)
 
 
 def photos(film):
@@ -67,10 +32,6 @@ def photos(film):
         station, angles = np.array([x, 0.0, 12.0]), (0.05, angle, 0.1 * x)
         found[name] = [taken(rng, p, station, angles, film) for p in (control, new)]
     return control, new, found
-
-
-def names_of(letter, points):
-    return [f"{letter}{k + 1}" for k in range(len(points))]
 
 
 def files(folder, film):
@@ -90,15 +51,6 @@ def files(folder, film):
         write(folder, texts[0], "control.csv"),
         write(folder, texts[1], "new.csv"),
         write(folder, known, "points.csv"),
-    )
-
-
-def one_image(tmp_path, places, points, header="point,x,y", *more):
-    """The tables of one image."""
-    names = names_of("c", points)
-    return (
-        write(tmp_path, table(header, names, *places.T, *more), "image.csv"),
-        write(tmp_path, table("point,X,Y,Z", names, *points.T), "points.csv"),
     )
 
 
