@@ -1,5 +1,5 @@
-"""The command line: `jaxro orient`, `clean`, `calibrate`, `colmap`, `compare`,
-`reproduce`, `heights`, `plan`.
+"""The command line: `jaxro orient`, `clean`, `calibrate`, `absolute`, `colmap`,
+`compare`, `reproduce`, `heights`, `plan`.
 
 Exit code 0: every pair has usable elements; 1: at least one has not; 2: the input could
 not be used.
@@ -17,6 +17,7 @@ except ModuleNotFoundError:
     ) from None
 
 from .commands import options as given
+from .commands.absolute_line import absolute
 from .commands.calibration_line import calibrate
 from .commands.ending import end
 from .commands.options import Engine, Residual
@@ -171,6 +172,7 @@ def clean(
 
 
 app.command()(calibrate)
+app.command()(absolute)
 
 
 @app.command()

@@ -1,5 +1,12 @@
-"""Strips and blocks of oriented pairs on the ground."""
+"""One model, strips and blocks of oriented pairs on the ground."""
 
+from .absolute import orient_model as orient_model, solutions as solutions
+from .absolute_model import (
+    MeasuredModel as MeasuredModel,
+    model as model,
+    model_of_pair as model_of_pair,
+)
+from .absolute_result import AbsoluteOrientation as AbsoluteOrientation
 from .adjust import BlockAdjustment as BlockAdjustment, adjust_block as adjust_block
 from .chain import Unjoined as Unjoined, chain as chain, models_of as models_of
 from .measured_block import (
@@ -9,5 +16,6 @@ from .measured_block import (
     ground as ground,
 )
 from .mock_block import Flight as Flight, mock_block as mock_block, pairs_of as pairs_of
+from .orient_block import OrientedBlock as OrientedBlock, orient_block as orient_block
 from .place import TooLittleControl as TooLittleControl, place as place
 from .wrong import adjust_without_wrong as adjust_without_wrong

@@ -1,0 +1,135 @@
+"""Tables of points on the ground and of model points."""
+
+import numpy as np
+import pytest
+from bad_tables import write
+
+from jaxro.tables import ground, model
+from jaxro.tables.fields import TableError
+
+GROUND = """\
+Point,X,Y,Z,sX,sY,sZ,Role
+a,1,2,3,.1,.2,.3,control
+b,4,5,,.1,.1,,
+c,,,6,,,0,Check
+d,7,8,9,1,1,1,approximate
+"""
+MODEL = """\
+pair,point,X_bases,Y_bases,Z_bases
+1-2,a,0.1,0.2,-1.5
+1-2,b,0.3,0.4,-1.6
+2-3,a,0.5,0.6,-1.7
+"""
+nan = np.nan
+
+
+def test_ground_points_become_numbers_with_roles(tmp_path):
+    """Blank coordinates are unknown, and have no standard deviation; a blank role is
+    control."""
+    read = ground.parse(GROUND, "ground.csv")
+    assert read.names == ["a", "b", "c", "d"]
+    assert read.roles == ["control", "control", "check", "approximate"]
+    expected = [[1, 2, 3], [4, 5, nan], [nan, nan, 6], [7, 8, 9]]
+    np.testing.assert_array_equal(read.coordinates, expected)
+    expected = [[0.1, 0.2, 0.3], [0.1, 0.1, nan], [nan, nan, 0], [1, 1, 1]]
+    np.testing.assert_array_equal(read.deviations, expected)
+    np.testing.assert_array_equal(read.is_a("control"), [True, True, False, False])
+    np.testing.assert_array_equal(read.known[1], [True, True, False])
+    np.testing.assert_array_equal(read.lines, [2, 3, 4, 5])
+
+    path = write(tmp_path, "point;X;Y;Z;sigma\nq;1,5;;2;0,5\n", "ground.csv")
+    one = ground.read(path, semicolons=True)
+    np.testing.assert_array_equal(one.coordinates, [[1.5, nan, 2.0]])
+    np.testing.assert_array_equal(one.deviations, [[0.5, nan, 0.5]])
+    plain = ground.parse("point,X,Y,Z\nq,1,2,3\n", "ground.csv")
+    assert plain.deviations is None and plain.roles == ["control"]
+    # as calibrate writes them
+    written = ground.parse("point,X,s_X,Y,s_Y,Z,s_Z\nq,1,.1,2,.2,3,.3\n", "points.csv")
+    np.testing.assert_array_equal(written.deviations, [[0.1, 0.2, 0.3]])
+
+
+BAD_GROUND = {  # what stands there, what stands there instead, said
+    "no points": (GROUND[GROUND.index("\n") :], "\n", "line 2: found no points"),
+    "twice": ("b,4", "a,4", "line 3, column point: found 'a' a second time (first on"),
+    "no name": ("b,4", ",4", "line 3, column point: found an empty field"),
+    "a word": ("b,4", "b,four", "line 3, column x: found 'four'"),
+    "nothing known": ("c,,,6,,,0", "c,,,,,,", "line 4, column x: found three empty"),
+    "negative": (".1,.2", "-.1,.2", "line 2, column sx: found '-.1'"),
+    "no deviation": (".1,.1,", ".1,,", "line 3, column sy: found an empty field"),
+    "role": (
+        "Check",
+        "tie",
+        "line 4, column role: found 'tie'; expected control, check",
+    ),
+    "one axis": ("sX,sY", "sX,sigma", "column sigma: found it beside sx"),
+    "unknown column": ("Role", "weight", "column weight: found an unknown column"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_GROUND)
+def test_bad_tables_of_the_ground_say_where(case):
+    old, new, said = BAD_GROUND[case]
+    assert old in GROUND
+    with pytest.raises(TableError) as raised:
+        ground.parse(GROUND.replace(old, new, 1), "ground.csv")
+    assert said in str(raised.value) and str(raised.value).startswith("ground.csv")
+
+
+def test_deviations_of_two_axes_are_not_enough():
+    with pytest.raises(TableError, match="column sz: found no such column beside sx"):
+        ground.parse("point,X,Y,Z,sX,sY\na,1,2,3,1,1\n", "ground.csv")
+
+
+def test_models_are_those_that_orient_writes():
+    """One of several pairs by its name; the unit stands in the header."""
+    read = model.parse(MODEL, "points.csv", "points", pair="1-2")
+    assert (read.pair, read.unit, read.names) == ("1-2", "bases", ["a", "b"])
+    np.testing.assert_array_equal(
+        read.coordinates, [[0.1, 0.2, -1.5], [0.3, 0.4, -1.6]]
+    )
+    assert read.deviations is None
+    np.testing.assert_array_equal(read.lines, [2, 3])
+    one = model.parse("point,x,y,z,sigma\na,1,2,3,.5\n", "one.csv", "one")
+    assert (one.pair, one.unit) == ("one", "")
+    np.testing.assert_array_equal(one.deviations, [[0.5, 0.5, 0.5]])
+
+
+BAD_MODEL = {
+    "several": ("", "", None, "--pair: found models of 2 pairs"),
+    "other": (
+        "",
+        "",
+        "3-4",
+        "--pair: found '3-4'; expected a pair of points.csv: '1-2'",
+    ),
+    "twice": ("2,b", "2,a", "1-2", "line 3, column point: found 'a' a second time"),
+    "blank": ("0.3,", ",", "1-2", "line 3, column x: found an empty field"),
+    "no Z": (",Z_bases", "", "1-2", "column z: found no such column"),
+    "another unit": (
+        "Z_bases",
+        "Y_mm",
+        "1-2",
+        "column y_mm: found this column a second",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_MODEL)
+def test_bad_tables_of_models_say_where(case):
+    old, new, pair, said = BAD_MODEL[case]
+    with pytest.raises(TableError) as raised:
+        model.parse(MODEL.replace(old, new, 1), "points.csv", "points", pair)
+    assert said in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("columns", "numbers", "said"),
+    [
+        ("sigma", "0", "line 2, column sigma: found '0'"),
+        ("sX", "1", "column sx: found it without other deviations"),
+        ("sX,sigma", "1,1", "column sx: found it beside other deviations"),
+    ],
+)
+def test_bad_deviations_of_a_model_are_refused(columns, numbers, said):
+    with pytest.raises(TableError, match=said):
+        model.parse(f"point,x,y,z,{columns}\na,1,2,3,{numbers}\n", "one.csv", "one")
