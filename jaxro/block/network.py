@@ -5,7 +5,7 @@ stations at once, by least squares.
 
 Unknown are six numbers of each photo and three of each point, which are eliminated: with
 the orientation elements among the unknowns, the system of conditions of the 1982
-fragment on independent models is exactly this one (`conditions`). It is sparse
+fragment on independent models is exactly this one. It is sparse
 (`adjustment.sparse`).
 """
 
