@@ -1,34 +1,13 @@
 """Calls of `jaxro calibrate`, the tables it reads, and those that it writes."""
 
-import csv
 import re
 
 import numpy as np
 from bad_tables import write
 from oracles_calibration import rotation
-from typer.testing import CliRunner
-
-from jaxro.cli import app
 
 SIGMA = 0.006
 """Standard deviation of a coordinate of the simulated photos, mm."""
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
-    assert result.exception is None or isinstance(result.exception, SystemExit), (
-        result.exception
-    )
-    return result
-
-
-def words(text):
-    return " ".join(text.split())
-
-
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def told(text, name):

@@ -90,7 +90,7 @@ class Joint(eqx.Module):
 
     def damped(self, steps: Steps, damping: Float[Array, ""]) -> DampedStep:
         """What Levenberg-Marquardt subtracts from the displacements."""
-        parts = [weigh(part, self.loss) for part in self.linearise(steps)]
+        parts = [_weight(part, self.loss) for part in self.linearise(steps)]
         normals = elimination.accumulate(self.layout, self.terms, parts)
         found = elimination.solve(
             elimination.damp(normals, damping), self._constraint(steps)
@@ -113,7 +113,7 @@ class Joint(eqx.Module):
     ) -> Solution:
         """The solution of the normal equations with the weights of a loss."""
         normals = elimination.accumulate(
-            self.layout, self.terms, [weigh(part, loss) for part in parts]
+            self.layout, self.terms, [_weight(part, loss) for part in parts]
         )
         return elimination.solve(normals, self._constraint(steps))
 
@@ -225,7 +225,7 @@ def _read(
         cofactor=solution.cofactor,
         residuals=tuple(part.residuals for part in parts),
         redundancy=tuple(
-            elimination.redundancies(layout, weighted, term, weigh(part, loss))
+            elimination.redundancies(layout, weighted, term, _weight(part, loss))
             for term, part in zip(terms, parts, strict=True)
         ),
         sigma0=jnp.where(checked, sigma0, jnp.nan),
@@ -238,7 +238,7 @@ def _read(
     )
 
 
-def weigh(part: Linearised, loss: AbstractLoss | None) -> Linearised:
+def _weight(part: Linearised, loss: AbstractLoss | None) -> Linearised:
     """Residuals and columns times the roots of the weights rho'(r²)."""
     if loss is None:
         return part

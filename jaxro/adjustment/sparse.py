@@ -30,12 +30,12 @@ from .block_tridiagonal import Levels, arrange
 from .blocks import Families, Steps, move, normalise
 from .elimination import layout
 from .levenberg_marquardt import DampedStep, LevenbergMarquardt, promised
-from .losses import AbstractLoss
 from .normal_equations import SINGULAR
 from .results import RESULTS
 from .sparse_factor import (
     Datum,
     Factored,
+    Reduced,
     Singular,
     Slots,
     factorise,
@@ -48,6 +48,7 @@ from .sparse_normals import (
     Roles,
     all_residuals,
     carry_back,
+    origin,
     read_solution,
     reduce_normals,
 )
@@ -74,9 +75,8 @@ class SparseAdjustment:
 
     `parameters`: by the name of their family. `residuals` (whitened) and `redundancy`:
     of each term. `cofactors`: of the local parameters of each member of the eliminated
-    and of the linked family, and of all common ones together. `factored` solves for the
-    cofactors of anything else. Without a solution (`result`) cofactors and
-    redundancies are NaN.
+    and of the linked family, and of all common ones together. Without a solution
+    (`result`) cofactors and redundancies are NaN.
     """
 
     parameters: dict[str, Any]
@@ -89,8 +89,6 @@ class SparseAdjustment:
     pivot: float
     iterations: int
     result: RESULTS
-    factored: Factored | None
-    carried: Carried | None
 
 
 class Problem(NamedTuple):
@@ -239,7 +237,7 @@ def _weighted(term: Term, weight: Float[np.ndarray, " group"]) -> Term:
 
 def residuals_of(problem: Problem) -> list[Float[np.ndarray, "_ _"]]:
     """The whitened residuals of each term where the families stand."""
-    rows = _System(problem, None, None)(_origin(problem))
+    rows = _System(problem, None)(origin(problem.data, problem.roles))
     return [np.asarray(a)[:n] for a, n in zip(rows, problem.groups, strict=True)]
 
 
@@ -249,11 +247,10 @@ class _System:
     `LevenbergMarquardt` asks for them."""
 
     problem: Problem
-    loss: AbstractLoss | None
     datum: DatumOf | None
 
     def __call__(self, steps: Steps) -> list[Array]:
-        options = {"data": self.problem.data, "loss": self.loss}
+        options = {"data": self.problem.data}
         return Program(all_residuals, options, COMPILE_FAST)(steps)
 
     def damped(self, steps: Steps, damping: Float[Array, ""]) -> DampedStep:
@@ -276,14 +273,28 @@ class _System:
         """The displacements followed by a step."""
         return jax.tree.map(jnp.add, steps, step)
 
-    def factorise(self, steps: Steps, damping: Float[Array, ""]):
+    def datum_at(self, steps: Steps) -> Datum:
+        """The datum of the displaced families, with rows for the room of the linked
+        one."""
+        data, roles, members = (
+            self.problem.data,
+            self.problem.roles,
+            self.problem.members,
+        )
+        found = self.datum(trimmed(displaced(data, steps), members))  # pyright: ignore[reportOptionalCall]
+        missing = roles.blocks - found.rows.shape[1]
+        return found._replace(rows=np.pad(found.rows, ((0, 0), (0, missing), (0, 0))))
+
+    def factorise(
+        self, steps: Steps, damping: Float[Array, ""]
+    ) -> tuple[Factored, Reduced, Carried]:
         """The factorised matrix, the reduced system, and what leads back."""
         problem = self.problem
         data, roles = problem.data, problem.roles
-        options = {"data": data, "roles": roles, "loss": self.loss}
+        options = {"data": data, "roles": roles}
         program = Program(reduce_normals, options, COMPILE_FAST)
         reduced, carried = program((steps, damping))
-        datum = None if self.datum is None else self.datum(displaced(data, steps))
+        datum = None if self.datum is None else self.datum_at(steps)
         factored = factorise(reduced, problem.slots, problem.levels, datum)
         return factored, reduced, carried
 
@@ -291,15 +302,14 @@ class _System:
 def minimise(
     problem: Problem,
     *,
-    loss: AbstractLoss | None = None,
     datum: DatumOf | None = None,
     max_steps: int = 30,
 ) -> Minimum:
-    """The least sum of squares, or of rho of them, from where the families stand."""
-    system = _System(problem, loss, datum)
+    """The least sum of squares, from where the families stand."""
+    system = _System(problem, datum)
     solver = LevenbergMarquardt(rtol=SHORT, damping=FIRST_DAMPING)
     function = lambda steps, system: (system(steps), None)
-    steps, done, result = _origin(problem), False, RESULTS.diverged
+    steps, done, result = origin(problem.data, problem.roles), False, RESULTS.diverged
     state = solver.init(function, steps, system, {}, None, None, frozenset())
     number = 0
     while number < max_steps and not done:
@@ -322,7 +332,7 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
     """Everything that follows from the linearisation at the minimum."""
     problem = found.problem
     data, roles, members = problem.data, problem.roles, problem.members
-    system, steps = _System(problem, None, datum), _origin(problem)
+    system, steps = _System(problem, datum), origin(problem.data, problem.roles)
     rows = residuals_of(problem)
     used = sum(
         int(np.sum(np.asarray(term.mask))) * r.shape[1]
@@ -330,13 +340,9 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
     )
     unknowns = members[roles.eliminated] * roles.point_size
     unknowns += members[roles.linked] * roles.block_size + roles.common_total
-    parameters = {
-        name: jax.tree.map(lambda a, n=members[name]: np.asarray(a)[:n], family)
-        for name, family in data.families.items()
-    }
     unknown = lambda name, d: np.full((members[name], d, d), np.nan)
     adjusted = SparseAdjustment(
-        parameters=parameters,
+        parameters=trimmed(data.families, members),
         residuals=rows,
         redundancy=[np.full_like(r, np.nan) for r in rows],
         cofactors={
@@ -349,8 +355,6 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
         pivot=0.0,
         iterations=found.iterations,
         result=found.result,
-        factored=None,
-        carried=None,
     )
     try:
         factored, _, carried = system.factorise(steps, jnp.zeros(()))
@@ -360,7 +364,7 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
     freedom += 0 if factored.free is None else len(factored.free.datum.rest)
     q, crossed, corner = factored.select(problem.slots)
     room = np.zeros((roles.slots - len(q), *q.shape[1:]))
-    options = {"data": data, "roles": roles, "loss": None}
+    options = {"data": data, "roles": roles}
     of_slots = jnp.asarray(np.concatenate([q, room]))
     solved = carried, of_slots, jnp.asarray(crossed), jnp.asarray(corner)
     of_points, redundancy = Program(read_solution, options, COMPILE_FAST)(solved)
@@ -381,9 +385,15 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
         degrees_of_freedom=freedom,
         pivot=pivot,
         result=RESULTS.rank_deficient if singular else found.result,
-        factored=factored,
-        carried=carried,
     )
+
+
+def trimmed(families: dict[str, Any], members: dict[str, int]) -> dict[str, Any]:
+    """The families without their room."""
+    return {
+        name: jax.tree.map(lambda a, n=members[name]: np.asarray(a)[:n], family)
+        for name, family in families.items()
+    }
 
 
 def displaced(data: Data, steps: Steps) -> dict[str, Any]:
@@ -396,15 +406,3 @@ def _displaced(data: tuple[dict[str, Any], Steps]) -> dict[str, Any]:
     return {
         name: normalise(move(family, steps[name])) for name, family in families.items()
     }
-
-
-def _origin(problem: Problem) -> Steps:
-    """No displacement."""
-    data, roles = problem.data, problem.roles
-    sizes = dict(zip(roles.common, roles.common_sizes, strict=True))
-    sizes |= {
-        roles.eliminated: roles.point_size,
-        roles.linked: roles.block_size,
-    }
-    number = lambda name: jax.tree.leaves(data.families[name])[0].shape[0]
-    return {name: jnp.zeros((number(name), sizes[name])) for name in data.families}

@@ -10,8 +10,6 @@ from jaxtyping import Array, Float, Int
 
 from .blocks import Linearised, Steps, linearise, residuals
 from .elimination import inverses
-from .joint import weigh
-from .losses import AbstractLoss
 from .sparse_factor import Pattern, Reduced
 from .terms import Term
 
@@ -81,19 +79,13 @@ class Read(NamedTuple):
     redundancy: list[Float[Array, "_ _"]]
 
 
-def all_residuals(
-    steps: Steps, data: Data, loss: AbstractLoss | None
-) -> list[Float[Array, "group m"]]:
-    """The whitened (and, with a loss, transformed) residuals of every term."""
-    found = [residuals(term, data.families, steps) for term in data.terms]
-    return found if loss is None else [loss.transform(r) for r in found]
+def all_residuals(steps: Steps, data: Data) -> list[Float[Array, "_ _"]]:
+    """The whitened residuals of every term."""
+    return [residuals(term, data.families, steps) for term in data.terms]
 
 
 def reduce_normals(
-    at: tuple[Steps, Float[Array, ""]],
-    data: Data,
-    roles: Roles,
-    loss: AbstractLoss | None,
+    at: tuple[Steps, Float[Array, ""]], data: Data, roles: Roles
 ) -> tuple[Reduced, Carried]:
     """The normal equations of displaced families, their diagonal larger by the part
     `damping`, after the elimination."""
@@ -106,7 +98,7 @@ def reduce_normals(
     common, b = jnp.zeros((c, c)), jnp.zeros(c)
     v, g, x = jnp.zeros((e, p, p)), jnp.zeros((e, p)), jnp.zeros((e, p, c))
     w, direct = [], list(of.direct)
-    for touched in _all_touched(data, steps, roles, loss):
+    for touched in _all_touched(data, steps, roles):
         r, cross = touched.residuals, touched.common
         common = common + jnp.einsum("gmi,gmj->ij", cross, cross)
         b = b + jnp.einsum("gmi,gm->i", cross, r)
@@ -137,7 +129,15 @@ def reduce_normals(
     inverse, pivots = inverses(v + _diagonal(_more(diagonals[2], damping)))
     w = jnp.concatenate(w)
     k = _times(inverse[of.point], w)
-    carried = Carried(inverse, pivots, g, x, w, right, diagonals)
+    carried = Carried(
+        inverse=inverse,
+        pivots=pivots,
+        g=g,
+        x=x,
+        w=w,
+        right=right,
+        diagonals=diagonals,
+    )
     of_x = _times(inverse, x)
     reduced = Reduced(
         blocks=_without_points(blocks, of, w, k),
@@ -192,7 +192,6 @@ def read_solution(
     ],
     data: Data,
     roles: Roles,
-    loss: AbstractLoss | None,
 ) -> Read:
     """Cofactors of the points and redundancies of all rows, from the cofactors of the
     linked and common parameters."""
@@ -219,10 +218,10 @@ def read_solution(
     with_links = -_times(inverse[of.point], seen)
     with_common = -_times(inverse, with_common)
 
-    steps = _no_steps(data, roles)
+    steps = origin(data, roles)
     redundancy, begin, direct = [], 0, list(of.direct)
     taken_by = lambda a, q, b: jnp.sum(_times(a, q) * b, axis=2)
-    every = zip(_all_touched(data, steps, roles, loss), data.terms, strict=True)
+    every = zip(_all_touched(data, steps, roles), data.terms, strict=True)
     for touched, term in every:
         cross = touched.common
         taken = taken_by(cross, corner[None], cross)
@@ -245,26 +244,21 @@ def read_solution(
     return Read(points, redundancy)
 
 
-def _no_steps(data: Data, roles: Roles) -> Steps:
-    sizes = {
-        roles.eliminated: (roles.points, roles.point_size),
-        roles.linked: (roles.blocks, roles.block_size),
-    }
-    for name, size in zip(roles.common, roles.common_sizes, strict=True):
-        members = jax.tree.leaves(data.families[name])[0].shape[0]
-        sizes[name] = members, size
-    return {name: jnp.zeros(sizes[name]) for name in data.families}
+def origin(data: Data, roles: Roles) -> Steps:
+    """No displacement."""
+    sizes = dict(zip(roles.common, roles.common_sizes, strict=True))
+    sizes |= {roles.eliminated: roles.point_size, roles.linked: roles.block_size}
+    number = lambda name: jax.tree.leaves(data.families[name])[0].shape[0]
+    return {name: jnp.zeros((number(name), sizes[name])) for name in data.families}
 
 
-def _all_touched(
-    data: Data, steps: Steps, roles: Roles, loss: AbstractLoss | None
-) -> list[Touched]:
+def _all_touched(data: Data, steps: Steps, roles: Roles) -> list[Touched]:
     """Every term, linearised."""
-    found = []
-    for term in data.terms:
-        part = weigh(linearise(term, data.families, steps), loss)
-        found.append(_touched(term, part, roles))
-    return found
+    parts = (linearise(term, data.families, steps) for term in data.terms)
+    return [
+        _touched(term, part, roles)
+        for term, part in zip(data.terms, parts, strict=True)
+    ]
 
 
 def _touched(term: Term, part: Linearised, roles: Roles) -> Touched:

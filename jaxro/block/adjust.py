@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..adjustment import RESULTS
 from ..adjustment.sparse import (
     DatumOf,
     Minimum,
@@ -22,7 +23,7 @@ from ..calibration.camera import Station
 from ..geometry import rotations as rot
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
-from .datum import inner_constraints
+from .datum import free_datum
 from .measured_block import Ground, MeasuredBlock
 from .network import (
     Frame,
@@ -48,6 +49,17 @@ class BlockAdjustment:
     numbered: Numbered
     known: KnownCoordinates
     adjustment: SparseAdjustment
+
+    @property
+    def result(self) -> RESULTS:
+        """How the adjustment ended."""
+        return self.adjustment.result
+
+    def check(self) -> "BlockAdjustment":
+        """This adjustment; RuntimeError with advice where it is not usable."""
+        if self.result != RESULTS.successful:
+            raise RuntimeError(f"adjust_block: {RESULTS[self.result]}")
+        return self
 
     @property
     def sigma0(self) -> float:
@@ -245,8 +257,16 @@ def prepare_block(
     points = units.inside(points[numbered.number >= 0])
     families = {"photo": stations, "point": points}
     problem = prepare(terms, families, eliminate="point", linked="photo")
-    datum = inner_constraints(stations) if len(terms) == 1 else None
-    return Prepared(block, ground, units, numbered, known, problem, datum)
+    datum = free_datum(stations) if len(terms) == 1 else None
+    return Prepared(
+        block=block,
+        ground=ground,
+        frame=units,
+        numbered=numbered,
+        known=known,
+        problem=problem,
+        datum=datum,
+    )
 
 
 def conclude(prepared: Prepared, found: Minimum) -> BlockAdjustment:

@@ -10,13 +10,19 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from ..geometry.elements import RelativePose
 from ..orientation.result import Orientation
 from .measured_block import MeasuredBlock
 
 ALONG_Y_AND_Z = np.array([1.0, -1.0, -1.0])
 """From photo axes (y up, z backward) to those of a camera (y down, z forward)."""
+
+
+PARALLEL = 1e-12
+"""Determinant of Σ (1 - d dᵀ) over the cube of the number of photos, below which rays
+count as parallel."""
 
 
 class Models(NamedTuple):
@@ -61,12 +67,21 @@ class Unjoined(ValueError):
         )
 
 
+class Oriented(NamedTuple):
+    """What is read of oriented pairs: pose, cofactors of its five elements, and whether
+    they may be used; arrays have a pair axis."""
+
+    pose: RelativePose
+    cofactor: Float[Array, "*pair 5 5"]
+    usable: Bool[Array, "*pair"]
+
+
 def models_of(
     left: Int[np.ndarray, " pair"],
     right: Int[np.ndarray, " pair"],
-    oriented: Orientation,
+    oriented: Oriented | Orientation,
 ) -> Models:
-    """The usable ones of oriented pairs (an `Orientation` with a pair axis)."""
+    """The usable ones of oriented pairs."""
     from scipy.spatial.transform import Rotation
 
     pose = oriented.pose
@@ -92,6 +107,8 @@ def chain(block: MeasuredBlock, models: Models) -> Chained:
     from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
     pairs, photos = len(models.left), len(block.photos)
+    if pairs == 0:
+        raise Unjoined(list(block.photos))
     one, other, ratio, spread = _ratios(models, _common(block, models))
     joined = coo_array((spread, (one, other)), (pairs, pairs)).tocsr()
     tree = minimum_spanning_tree(joined)
@@ -161,7 +178,7 @@ def rays_of(block: MeasuredBlock) -> Float[np.ndarray, "ray 3"]:
 
 def intersect(block: MeasuredBlock, chained: Chained) -> Float[np.ndarray, "point 3"]:
     """The points nearest to their rays, Σ (1 - d dᵀ) (X - S) = 0; NaN for points on one
-    photo."""
+    photo, and where all rays are parallel."""
     turned = chained.rotations[block.photo]
     d = np.einsum("rji,rj->ri", turned, rays_of(block))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -172,7 +189,9 @@ def intersect(block: MeasuredBlock, chained: Chained) -> Float[np.ndarray, "poin
     np.add.at(n, block.point, across)
     np.add.at(h, block.point, right)
     seen = np.unique(np.stack([block.point, block.photo]), axis=1)[0]
-    there = np.bincount(seen, minlength=number) >= 2
+    photos = np.bincount(seen, minlength=number)
+    # the determinant of parallel rays is rounding
+    there = (photos >= 2) & (np.linalg.det(n) > PARALLEL * photos**3)
     n[~there] = np.eye(3)
     found = np.linalg.solve(n, h[:, :, None])[:, :, 0]
     return np.where(there[:, None], found, np.nan)
@@ -193,14 +212,16 @@ def _common(block: MeasuredBlock, models: Models) -> Seen:
         )
         rows.append((np.full(len(first), k), of_left[first], of_right[second]))
     pair, one, other = (np.concatenate(a) for a in zip(*rows, strict=True))
-    l, r = rays[one], np.einsum("rij,rj->ri", models.rotation[pair], rays[other])
+    a, b = rays[one], np.einsum("rij,rj->ri", models.rotation[pair], rays[other])
     base = models.base[pair]
-    # λ l - μ r = b by least squares
-    ll, lr, rr = (np.sum(a * b, axis=1) for a, b in ((l, l), (l, r), (r, r)))
-    lb, rb = np.sum(l * base, axis=1), np.sum(r * base, axis=1)
-    volume = ll * rr - lr * lr
+    # λ a - μ b = base by least squares
+    dot = lambda first, second: np.sum(first * second, axis=1)
+    aa, ab, bb = dot(a, a), dot(a, b), dot(b, b)
+    along_a, along_b = dot(a, base), dot(b, base)
+    volume = aa * bb - ab * ab
     safe = np.where(volume > 0, volume, np.inf)
-    left, right = (rr * lb - lr * rb) / safe, (lr * lb - ll * rb) / safe
+    left = (bb * along_a - ab * along_b) / safe
+    right = (ab * along_a - aa * along_b) / safe
     ahead = (left > 0) & (right > 0)
     return Seen(pair[ahead], block.point[one][ahead], left[ahead], right[ahead])
 

@@ -138,15 +138,15 @@ def pairs_of(
     begins = np.searchsorted(pair, np.arange(len(order) + 1))
     left, right = block.photo[one[begins[:-1]]], block.photo[other[begins[:-1]]]
     pairs = Ragged(
-        begins,
-        block.x[one],
-        block.y[one],
-        block.x[other],
-        block.y[other],
-        np.maximum(block.sigma[one], block.sigma[other]),
-        np.ones(len(one), bool),
-        block.focal[left],
-        block.focal[right],
+        begins=begins,
+        x_left=block.x[one],
+        y_left=block.y[one],
+        x_right=block.x[other],
+        y_right=block.y[other],
+        sigma=np.maximum(block.sigma[one], block.sigma[other]),
+        mask=np.ones(len(one), bool),
+        focal_left=block.focal[left],
+        focal_right=block.focal[right],
     )
     name = lambda numbers: [block.photos[k] for k in numbers]
     return name(left), name(right), pairs, [block.points[k] for k in block.point[one]]

@@ -61,11 +61,6 @@ def of_coordinate(point: Float[Array, "3"], known: tuple[Array, Array]):
     return point[known[0]] - known[1]
 
 
-def of_station(station: Station, known: tuple[Array, Array]):
-    """The misfit of one known coordinate of a projection centre."""
-    return station.centre[known[0]] - known[1]
-
-
 def frame_of(start: Start) -> Frame:
     """The frame of a block: its middle, and the mean height above the points."""
     _, centres, points = start

@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..batches.ragged import Ragged, orient_ragged
+from ..batches.ragged import Ragged, clean_ragged
+from ..rejection import Recommended, Rejection
 from .adjust import BlockAdjustment
-from .chain import Chained, chain, intersect, models_of
+from .chain import Chained, Oriented, chain, intersect, models_of
 from .measured_block import Ground, MeasuredBlock, from_pairs
 from .network import Start
 from .place import Placed, on_ground, place
@@ -31,8 +32,8 @@ def orient_block(
     ground: Ground | None = None,
     more: MeasuredBlock | None = None,
 ) -> OrientedBlock:
-    """Orient the pairs, chain them, place them on the ground, and adjust everything,
-    without what is wrong.
+    """Orient the pairs without their wrong points, chain them, place them on the ground,
+    and adjust everything, without what is wrong.
 
     `left`, `right`: the photos of each pair, in any order and direction; `points`: the
     names of all rows of `pairs`; `more`: the block with further rays, such as known
@@ -44,19 +45,25 @@ def orient_block(
     models = models_of(
         np.array([number[name] for name in left]),
         np.array([number[name] for name in right]),
-        orient_ragged(pairs),
+        Oriented(*clean_ragged(pairs, Recommended(), select=_read)[0]),
     )
     chained = chain(block, models)
     placed = None
     if ground is not None:
         placed = place(block, chained, ground)
-        chained = on_ground(chained, placed.similarity)
+        chained = on_ground(chained, placed)
         at = np.where(placed.wrong[:, None], np.nan, ground.coordinates)
         ground = ground._replace(coordinates=at)
     adjusted, wrong = adjust_without_wrong(block, start_from(block, chained), ground)
     if placed is not None:
-        wrong = Wrong(wrong.rays, wrong.control | placed.wrong[:, None])
+        wrong = wrong._replace(control=wrong.control | placed.wrong[:, None])
     return OrientedBlock(adjusted, wrong, placed)
+
+
+def _read(rejection: Rejection) -> tuple[tuple, tuple]:
+    """The `Oriented` of a pair, and nothing of its points."""
+    found = rejection.orientation
+    return (found.pose, found.cofactor, found.usable), ()
 
 
 def start_from(block: MeasuredBlock, chained: Chained) -> Start:

@@ -26,25 +26,26 @@ NEIGHBOURS = 6
 """Known points that one is compared with."""
 
 
-class Similarity(NamedTuple):
-    """ground = shift + scale * rotation @ chained"""
+WIDE = 5.0
+"""Root mean square distance of known points from a line, in their standard deviations,
+from which on they are not on it."""
+
+
+class Placed(NamedTuple):
+    """Where a block stands on the ground, shift + scale rotation x; how far each known
+    point is from there (NaN: not compared); and those that do not fit (`wrong`): they
+    have wrong coordinates, another point's name, or a wrong place on a photo."""
 
     rotation: Float[np.ndarray, "3 3"]
     scale: float
     shift: Float[np.ndarray, "3"]
-
-
-class Placed(NamedTuple):
-    """Where the block stands on the ground: the similarity, how far each known point is
-    from where it puts it (NaN: not compared), and those that do not fit (`wrong`)."""
-
-    similarity: Similarity
     apart: Float[np.ndarray, " known"]
     wrong: Bool[np.ndarray, " known"]
 
 
 class TooLittleControl(ValueError):
-    """Fewer than three known points, or all of them on one line."""
+    """Fewer than three known points, all of them on one line, or hardly one that fits
+    the photos."""
 
 
 def place(
@@ -75,17 +76,33 @@ def place(
     half = min(len(whole) - 1, max(3, len(whole) // 2))
     middle = np.where(np.isfinite(of_half[:, half]), of_half[:, half], np.inf)
     best = int(np.argmin(middle))
-    if not np.isfinite(middle[best]):
-        raise TooLittleControl("the known points lie on one line")
+    if not np.isfinite(middle[best]) or _is_line(at[whole], ground.sigma[whole]):
+        raise TooLittleControl(
+            "the known points lie on one line, about which the block can turn; one "
+            "point away from it is needed"
+        )
     wrong = np.zeros(len(known[best]), bool)
     if len(whole) > 4:
         wrong[whole] = _stands_out(model[whole], apart[best, whole])
     used = whole[~wrong[whole]]
-    all_ = _similarities(model[used][None], at[used][None])
-    found = Similarity(all_[0][0], float(all_[1][0]), all_[2][0])
-    fitted = found.shift + found.scale * model @ found.rotation.T - at
+    (rotation,), (scale,), (shift,) = _similarities(model[used][None], at[used][None])
+    fitted = shift + scale * model @ rotation.T - at
     left = np.sqrt(np.nansum(fitted**2, axis=1))
-    return Placed(found, np.where(known[best], left, np.nan), wrong)
+    return Placed(
+        rotation=rotation,
+        scale=float(scale),
+        shift=shift,
+        apart=np.where(known[best], left, np.nan),
+        wrong=wrong,
+    )
+
+
+def _is_line(
+    at: Float[np.ndarray, "some 3"], sigma: Float[np.ndarray, "some 3"]
+) -> bool:
+    """Whether points are as near to a line as their errors allow."""
+    axes = np.linalg.svd(at - at.mean(axis=0), compute_uv=False)
+    return bool(axes[1] < WIDE * np.median(sigma) * np.sqrt(len(at)))
 
 
 def _stands_out(
@@ -101,12 +118,11 @@ def _stands_out(
     return left > FAR * np.median(left)
 
 
-def on_ground(chained: Chained, similarity: Similarity) -> Chained:
+def on_ground(chained: Chained, placed: Placed) -> Chained:
     """The chained photos in ground coordinates."""
-    rotation, scale, shift = similarity
-    return Chained(
-        chained.rotations @ rotation.T, shift + scale * chained.centres @ rotation.T
-    )
+    turn = placed.rotation.T
+    centres = placed.shift + placed.scale * chained.centres @ turn
+    return Chained(chained.rotations @ turn, centres)
 
 
 def _triples(whole: np.ndarray, seed: int) -> np.ndarray:

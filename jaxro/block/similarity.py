@@ -18,6 +18,9 @@ from ..xla.passes import count
 Vector = Float[Array, "3"]
 Points = Float[Array, "point 3"]
 
+TURN_AND_SHIFT = (1, 2, 3), (4, 5, 6)
+"""The local parameters of a `Similarity` behind the change of its scale."""
+
 
 class Similarity(AbstractParameters):
     """Scale, the quaternion of the rotation from model to ground (of any length), and
@@ -37,24 +40,14 @@ class Similarity(AbstractParameters):
         return 7
 
     def move(self, step) -> "Similarity":
-        w, x, y, z = (self.quaternion[k] for k in range(4))
-        a, b, c = (step[k] / 2 for k in (1, 2, 3))
-        turned = jnp.stack(
-            [
-                w - a * x - b * y - c * z,
-                x + a * w + b * z - c * y,
-                y + b * w + c * x - a * z,
-                z + c * w + a * y - b * x,
-            ]
-        )
-        along = jnp.stack([step[k] for k in (4, 5, 6)])
+        turn, along = (jnp.stack([step[k] for k in axes]) for axes in TURN_AND_SHIFT)
+        turned = rot.turn_quaternion(self.quaternion, turn)
         scale = self.scale * jnp.exp(step[0])
         return Similarity(scale, turned, self.shift + self.scale * along)
 
     def normalise(self) -> "Similarity":
-        length = jnp.sqrt(jnp.sum(self.quaternion**2))
-        sign = jnp.where(self.quaternion[0] < 0, -1.0, 1.0)
-        return Similarity(self.scale, self.quaternion * sign / length, self.shift)
+        turned = rot.unit_quaternion(self.quaternion)
+        return Similarity(self.scale, turned, self.shift)
 
     @property
     def rotation(self) -> rot.Matrix:

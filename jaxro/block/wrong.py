@@ -18,6 +18,7 @@ from ..adjustment.sparse import Minimum, Problem, minimise, residuals_of
 from .adjust import BlockAdjustment, Prepared, conclude, prepare_block
 from .measured_block import Ground, MeasuredBlock
 from .network import Start
+from .place import TooLittleControl
 
 SURE = 3.0
 """The last scale c of the redescending weights, in standard deviations."""
@@ -34,15 +35,23 @@ ROUNDS = 8
 TESTS = 20
 """Rounds of tests."""
 
+DATUM = 7
+"""Known coordinates that a block needs."""
+
 UNCHECKED = 0.02
 """Redundancy below which nothing checks a coordinate: it is told, not tested."""
 
 
 class Wrong(NamedTuple):
-    """What was left out: rays, and known coordinates."""
+    """What was left out: rays, and known coordinates; `settled`: whether nothing more
+    is beyond the limit of the tests."""
 
     rays: Bool[np.ndarray, " ray"]
     control: Bool[np.ndarray, "known 3"]
+    settled: bool = False
+
+    def __or__(self, other: "Wrong") -> "Wrong":
+        return Wrong(self.rays | other.rays, self.control | other.control)
 
 
 class Tested(NamedTuple):
@@ -60,16 +69,17 @@ def adjust_without_wrong(
     ground: Ground | None = None,
     level: float = 0.05,
 ) -> tuple[BlockAdjustment, Wrong]:
-    """Adjust a block without its wrong rays and known coordinates."""
+    """Adjust a block without its wrong rays and known coordinates. Raises
+    `TooLittleControl` where hardly a known coordinate fits the photos."""
     prepared = prepare_block(block, start, ground)
     found = settle(prepared)
     wrong = _far(prepared, found)
     adjusted = adjust_rest(block, prepared.start_at(found), ground, wrong)
     for _ in range(TESTS):
-        more = _worst(adjusted, test(adjusted, level))
+        more = _worst(adjusted, normalise_residuals(adjusted, level))
         if not (np.any(more.rays) or np.any(more.control)):
-            break
-        wrong = Wrong(wrong.rays | more.rays, wrong.control | more.control)
+            return adjusted, wrong._replace(settled=True)
+        wrong = wrong | more
         adjusted = adjust_rest(block, adjusted.as_start, ground, wrong)
     return adjusted, wrong
 
@@ -80,12 +90,25 @@ def adjust_rest(
     """The adjustment without what is wrong; rays and points keep their numbers."""
     if ground is not None:
         at = np.where(wrong.control, np.nan, ground.coordinates)
+        _check_control(ground, at)
         ground = ground._replace(coordinates=at)
     prepared = prepare_block(block, start, ground, left_out=wrong.rays)
     return conclude(prepared, minimise(prepared.problem, datum=prepared.datum))
 
 
-def test(adjusted: BlockAdjustment, level: float = 0.05) -> Tested:
+def _check_control(ground: Ground, left: Float[np.ndarray, "known 3"]) -> None:
+    """Raises `TooLittleControl` where the photos contradict nearly all that is
+    known."""
+    number = lambda at: int(np.sum(np.isfinite(at[~ground.check])))
+    if number(left) < DATUM <= number(ground.coordinates):
+        raise TooLittleControl(
+            f"{number(left)} of {number(ground.coordinates)} known coordinates fit the "
+            f"photos, {DATUM} are needed: look at the names, the system and the unit of "
+            "the known points"
+        )
+
+
+def normalise_residuals(adjusted: BlockAdjustment, level: float = 0.05) -> Tested:
     """w = v / (sigma0 sigma √r) of all coordinates that something checks."""
     normalise = lambda v, sigma, r: np.where(
         r > UNCHECKED, v / (sigma * np.sqrt(np.maximum(r, UNCHECKED))), np.nan

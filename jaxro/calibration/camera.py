@@ -24,6 +24,9 @@ from .images import Pair
 
 Vector = Float[Array, "3"]
 
+TURN_AND_SHIFT = (0, 1, 2), (3, 4, 5)
+"""The local parameters of a `Station`."""
+
 
 class Station(AbstractParameters):
     """Where the camera stood and how it was turned: the projection centre, and the unit
@@ -41,22 +44,12 @@ class Station(AbstractParameters):
         return 6
 
     def move(self, step) -> "Station":
-        w, x, y, z = (self.quaternion[k] for k in range(4))
-        a, b, c = (step[k] / 2 for k in range(3))
-        turned = jnp.stack(
-            [
-                w - a * x - b * y - c * z,
-                x + a * w + b * z - c * y,
-                y + b * w + c * x - a * z,
-                z + c * w + a * y - b * x,
-            ]
-        )
-        return Station(turned, self.centre + jnp.stack([step[k] for k in (3, 4, 5)]))
+        turn, along = (jnp.stack([step[k] for k in axes]) for axes in TURN_AND_SHIFT)
+        turned = rot.turn_quaternion(self.quaternion, turn)
+        return Station(turned, self.centre + along)
 
     def normalise(self) -> "Station":
-        length = jnp.sqrt(jnp.sum(self.quaternion**2))
-        sign = jnp.where(self.quaternion[0] < 0, -1.0, 1.0)
-        return Station(self.quaternion * sign / length, self.centre)
+        return Station(rot.unit_quaternion(self.quaternion), self.centre)
 
     def to_camera(self, point: Vector) -> rot.Vector:
         """R (X - S), times the squared length of the quaternion."""

@@ -106,16 +106,17 @@ def _known_points(measured: MeasuredImages, given: Frame) -> Term:
 
 
 def _inner_constraints(begin: Station) -> Callable[[dict[str, Any]], Array]:
-    """The seven inner constraints on displacements dS of the stations: Σ dS = 0,
-    Σ S × dS = 0 and Σ S · dS = 0, with S from their centroid. The stations are neither
-    shifted nor turned nor scaled as a whole (Meissl 1962)."""
-    about = begin.centre - jnp.mean(begin.centre, axis=0)[None]
+    """`inner_constraints` of the family "station"."""
+    return lambda families: inner_constraints(begin.centre, families["station"].centre)
 
-    def of_stations(families: dict[str, Any]) -> Array:
-        moved = families["station"].centre - begin.centre
-        shift = jnp.sum(moved, axis=0)
-        turn = jnp.sum(jnp.cross(about, moved), axis=0)
-        scale = jnp.sum(about * moved)
-        return jnp.concatenate([shift, turn, scale[None]])
 
-    return of_stations
+def inner_constraints(
+    begin: Float[Array, "image 3"], centres: Float[Array, "image 3"]
+) -> Float[Array, "7"]:
+    """Zero where displacements dS do not shift, turn or scale stations as a whole:
+    Σ dS, Σ S × dS and Σ S · dS, with S from their centroid (Meissl 1962)."""
+    about, moved = begin - jnp.mean(begin, axis=0)[None], centres - begin
+    shift = jnp.sum(moved, axis=0)
+    turn = jnp.sum(jnp.cross(about, moved), axis=0)
+    scale = jnp.sum(about * moved)
+    return jnp.concatenate([shift, turn, scale[None]])

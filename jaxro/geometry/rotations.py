@@ -161,6 +161,29 @@ def from_quaternion(w: Scalar, x: Scalar, y: Scalar, z: Scalar) -> Matrix:
     )
 
 
+def turn_quaternion(
+    quaternion: Float[Array, "4"], turn: Float[Array, "3"]
+) -> Float[Array, "4"]:
+    """A quaternion after a small turn: (1, turn/2) times it."""
+    w, x, y, z = (quaternion[k] for k in range(4))
+    a, b, c = (turn[k] / 2 for k in range(3))
+    return jnp.stack(
+        [
+            w - a * x - b * y - c * z,
+            x + a * w + b * z - c * y,
+            y + b * w + c * x - a * z,
+            z + c * w + a * y - b * x,
+        ]
+    )
+
+
+def unit_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The quaternion of the same rotation with length 1 and w >= 0."""
+    length = jnp.sqrt(jnp.sum(quaternion**2))
+    sign = jnp.where(quaternion[0] < 0, -1.0, 1.0)
+    return quaternion * sign / length
+
+
 def to_quaternion(r: Matrix) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
 

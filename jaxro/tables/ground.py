@@ -22,12 +22,13 @@ from .survey_checks import Row
 AXES = ("x", "y", "z")
 DEVIATIONS = ("sx", "sy", "sz")
 ROLES = ("control", "check", "approximate")
+SHORT = {"s_x": "sx", "s_y": "sy", "s_z": "sz"}
 TEXTS = ("point", "role")
 
 GROUND = Columns(
     ("point", *AXES),
     (*DEVIATIONS, "sigma", "role"),
-    {"s_x": "sx", "s_y": "sy", "s_z": "sz"},
+    SHORT,
     texts=TEXTS,
 )
 

@@ -16,11 +16,10 @@ from jaxtyping import Float, Int
 
 from . import fields
 from .fields import Columns, TableError
-from .ground import AXES, DEVIATIONS
+from .ground import AXES, DEVIATIONS, SHORT
 
 NUMBERS = (*AXES, *DEVIATIONS, "sigma")
 WITH_UNIT = re.compile(r"([xyz])_(\w+)")
-SHORT = {"s_x": "sx", "s_y": "sy", "s_z": "sz"}
 SHOWN = 5
 """Names that an error tells of a longer list."""
 

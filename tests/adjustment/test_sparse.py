@@ -9,8 +9,9 @@ from jaxro.adjustment import RESULTS, Term, adjust
 from jaxro.adjustment.sparse import adjust_sparse
 from jaxro.adjustment.sparse_factor import Anchor, Datum
 
-PHOTOS, SIGMA = 12, 0.01
-"""Photos of a strip, and the standard deviation of a place."""
+PHOTOS, SIGMA = 13, 0.01
+"""Photos of a strip (not a number for which there is exact room), and the standard
+deviation of a place."""
 
 
 def image(photo, point, focal):

@@ -7,12 +7,12 @@ import pytest
 
 from jaxro import block
 from jaxro.adjustment import RESULTS
-from jaxro.batches.ragged import Ragged
+from jaxro.batches.ragged import Ragged, orient_ragged
 from jaxro.block.adjust import adjust_block
 from jaxro.block.chain import Chained
 from jaxro.block.measured_block import MeasuredBlock
 from jaxro.block.orient_block import orient_block, start_from
-from jaxro.block.wrong import test as normalised
+from jaxro.block.wrong import normalise_residuals
 
 
 def read(file):
@@ -100,7 +100,7 @@ def test_a_published_block(strasbourg):
     np.testing.assert_allclose(
         np.degrees(found.angle_deviations), published[:, 9:12], rtol=5e-3
     )
-    w = np.nanmax(np.abs(normalised(found).control), axis=1)
+    w = np.nanmax(np.abs(normalise_residuals(found).control), axis=1)
     first = int(np.argmax(w))
     assert known.points[first] == "410" and 4.5 < w[first] < 4.9
 
@@ -187,19 +187,47 @@ def test_from_pairs_in_any_order_to_the_truth(flight):
     assert np.sum(oriented.wrong.rays) <= 2
 
 
-def test_wrong_ties_are_found():
-    """Every twentieth ray is wrong by millimetres."""
-    mock = block.mock_block(3, block.Flight(strips=3, models=8))
-    rng = np.random.default_rng(3)
-    bad = rng.random(len(mock.block.x)) < 0.05
+def with_wrong_rays(mock, seed, share):
+    """The block with one ray of so many points moved by up to 20 mm, and which."""
+    rng, measured = np.random.default_rng(seed), mock.block
+    wrong = rng.random(len(measured.points)) < share
+    order = rng.random(len(measured.x))
+    last = np.zeros(len(measured.points))
+    np.maximum.at(last, measured.point, order)
+    bad = wrong[measured.point] & (order == last[measured.point])
     moved = lambda a: np.where(bad, a + rng.uniform(-20, 20, len(a)), a)
-    measured = mock.block._replace(x=moved(mock.block.x), y=moved(mock.block.y))
-    start = start_from(measured, mock.photos)
-    found, wrong = block.adjust_without_wrong(measured, start, mock.ground)
-    assert 0.93 < found.sigma0 < 1.07
-    assert np.sum(wrong.rays & bad) > 0.9 * np.sum(bad)
-    z = (found.centres - mock.photos.centres) / found.centre_deviations
+    return measured._replace(x=moved(measured.x), y=moved(measured.y)), bad
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2])
+def test_wrong_ties_are_found(share):
+    """From the pairs alone."""
+    mock = block.mock_block(3, block.Flight(strips=3, models=8))
+    measured, bad = with_wrong_rays(mock, 3, share)
+    left, right, pairs, points = block.pairs_of(measured)
+    oriented = orient_block(left, right, pairs, points, mock.ground)
+    found = oriented.adjusted.check()
+    assert oriented.wrong.settled and 0.93 < found.sigma0 < 1.07
+    places = set(zip(measured.x[bad], measured.y[bad], strict=True))
+    kept = found.numbered.rays
+    left_over = set(zip(found.block.x[kept], found.block.y[kept], strict=True))
+    assert len(places & left_over) < 0.1 * np.sum(bad)
+    place = [mock.block.photos.index(name) for name in found.block.photos]
+    z = (found.centres - mock.photos.centres[place]) / found.centre_deviations
     assert np.max(np.abs(z)) < 4.5
+
+
+def test_control_of_another_system_is_not_left_out_silently():
+    """X and Y exchanged: the photos contradict all of it."""
+    mock = block.mock_block(3, block.Flight(strips=2, models=4))
+    at = mock.ground.coordinates[:, [1, 0, 2]]
+    start = start_from(mock.block, mock.photos)
+    with pytest.raises(
+        block.TooLittleControl, match="known coordinates fit the photos"
+    ):
+        block.adjust_without_wrong(
+            mock.block, start, mock.ground._replace(coordinates=at)
+        )
 
 
 def test_swapped_names_of_control_are_found_before_the_adjustment():
@@ -226,24 +254,93 @@ def test_parts_without_a_common_scale_are_refused():
         orient_block(left, right, pairs, points, mock.ground)
 
 
-def test_control_on_a_line_and_too_little_of_it_are_refused():
+def test_too_little_control_is_refused():
     mock = block.mock_block(6)
     few = block.ground(mock.ground.points[:2], mock.ground.coordinates[:2], 0.02)
     with pytest.raises(block.TooLittleControl, match="2 known points"):
         block.place(mock.block, mock.photos, few)
 
 
-def test_a_free_network_has_the_inner_geometry_of_a_controlled_one():
-    """Without control: residuals of the rays of a block with minimal control."""
-    mock = block.mock_block(7, block.Flight(models=4))
+def test_control_on_a_line_is_refused():
+    """Within its errors: of five tie points, moved onto a line with all their rays."""
+    mock = block.mock_block(6)
+    rng = np.random.default_rng(6)
+    chained = mock.photos
+    line = np.linspace([500.0, 100.0, 20.0], [8000.0, 300.0, 60.0], 5)
+    measured, names = mock.block, mock.block.points[:5]
+    rays = np.flatnonzero(measured.point < 5)
+    apart = line[measured.point[rays]] - chained.centres[measured.photo[rays]]
+    inside = np.einsum("rij,rj->ri", chained.rotations[measured.photo[rays]], apart)
+    x, y = measured.x.copy(), measured.y.copy()
+    x[rays] = 153 * inside[:, 0] / inside[:, 2]
+    y[rays] = -153 * inside[:, 1] / inside[:, 2]
+    known = block.ground(names, line + rng.normal(0, 0.02, (5, 3)), 0.02)
+    with pytest.raises(block.TooLittleControl, match="on one line"):
+        block.place(measured._replace(x=x, y=y), chained, known)
+
+
+@pytest.mark.parametrize("models", [4, 8])
+def test_a_free_network_determines_all_but_its_datum(models):
+    """Five photos, and nine, for which there is no exact room."""
+    mock = block.mock_block(7, block.Flight(models=models))
     chained = Chained(mock.photos.rotations, mock.photos.centres)
     free = adjust_block(mock.block, start_from(mock.block, chained))
     assert free.adjustment.result == RESULTS.successful
     count = free.numbered.number.max() + 1
     rays = int(np.sum(free.numbered.rays))
-    assert free.degrees_of_freedom == 2 * rays - 6 * 5 - 3 * count + 7
+    photos = models + 1
+    assert free.degrees_of_freedom == 2 * rays - 6 * photos - 3 * count + 7
     w = free.residuals / mock.block.sigma[:, None]
     squares = np.nansum(w**2) / free.degrees_of_freedom
     np.testing.assert_allclose(free.sigma0**2, squares, rtol=1e-9)
     redundancy = np.nansum(free.redundancy)
     np.testing.assert_allclose(redundancy, free.degrees_of_freedom, rtol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flight", [(1, 10), (5, 10)])
+def test_intervals_of_photos_and_points_hold_the_truth(flight):
+    """200 strips, 200 blocks; and the ellipsoids of the points."""
+    strips, models = flight
+    photos, points, ellipsoids = [], [], []
+    for seed in range(200):
+        mock = block.mock_block(1000 + seed, block.Flight(strips=strips, models=models))
+        found = adjust_block(
+            mock.block, start_from(mock.block, mock.photos), mock.ground
+        )
+        apart = np.abs(found.centres - mock.photos.centres)
+        photos.append(np.mean(apart < 1.96 * found.centre_deviations))
+        seen = found.numbered.number >= 0
+        apart = (found.coordinates - mock.points)[seen]
+        points.append(np.mean(np.abs(apart) < 1.96 * found.deviations[seen]))
+        weights = np.linalg.inv(found.point_covariances[seen])
+        squares = np.einsum("pi,pij,pj->p", apart, weights, apart)
+        ellipsoids.append(np.mean(squares < 7.815))
+    for share in (photos, points, ellipsoids):
+        assert 0.94 < np.mean(share) < 0.96
+
+
+@pytest.mark.slow
+def test_swapped_names_in_a_hundred_blocks():
+    """Chained from their pairs, without wrong ties."""
+    hits = 0
+    for seed in range(100):
+        mock = block.mock_block(2000 + seed, block.Flight(strips=5, models=10))
+        rng = np.random.default_rng(seed)
+        names, swapped = (
+            list(mock.ground.points),
+            rng.choice(len(mock.ground.points), 2),
+        )
+        if swapped[0] == swapped[1]:
+            swapped[1] = (swapped[0] + 1) % len(names)
+        i, j = swapped
+        names[i], names[j] = names[j], names[i]
+        left, right, pairs, points = block.pairs_of(mock.block, seed)
+        measured = block.from_pairs(left, right, pairs, points)
+        number = {name: k for k, name in enumerate(measured.photos)}
+        ends = (np.array([number[name] for name in end]) for end in (left, right))
+        chained = block.chain(measured, block.models_of(*ends, orient_ragged(pairs)))
+        ground = mock.ground._replace(points=tuple(names))
+        placed = block.place(measured, chained, ground)
+        hits += np.flatnonzero(placed.wrong).tolist() == sorted((i, j))
+    assert hits >= 95

@@ -1,35 +1,15 @@
 """`jaxro absolute` as its user meets it: reports, files, what is said of control that is
 not enough and of bad tables."""
 
-import csv
-
 import numpy as np
 import pytest
 from bad_tables import write
-from typer.testing import CliRunner
+from command_line import rows, run, words
 
 from jaxro.block import absolute
 from jaxro.block.absolute_model import model
-from jaxro.cli import app
 from jaxro.tables import ground as grounds, model as models
 from jaxro.tables.examples import absolute as example
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
-    assert result.exception is None or isinstance(result.exception, SystemExit), (
-        result.exception
-    )
-    return result
-
-
-def words(text):
-    return " ".join(text.split())
-
-
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def numbers(table, *columns):

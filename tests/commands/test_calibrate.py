@@ -6,17 +6,8 @@ import re
 import numpy as np
 import pytest
 from bad_tables import write
-from calibrate_command import (
-    SIGMA,
-    names_of,
-    numbers,
-    one_image,
-    rows,
-    run,
-    table,
-    taken,
-    words,
-)
+from calibrate_command import SIGMA, names_of, numbers, one_image, table, taken
+from command_line import rows, run, words
 
 from jaxro import calibration
 from jaxro.tables.examples import calibration as example

@@ -6,18 +6,8 @@ import re
 import numpy as np
 import pytest
 from bad_tables import write
-from calibrate_command import (
-    SIGMA,
-    names_of,
-    numbers,
-    one_image,
-    rows,
-    run,
-    table,
-    taken,
-    told,
-    words,
-)
+from calibrate_command import SIGMA, names_of, numbers, one_image, table, taken, told
+from command_line import rows, run, words
 from oracles_calibration import rotation
 
 from jaxro import calibration

@@ -5,16 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from bad_tables import write
-from calibrate_command import (
-    SIGMA,
-    names_of,
-    numbers,
-    rows,
-    run,
-    table,
-    taken,
-    words,
-)
+from calibrate_command import SIGMA, names_of, numbers, table, taken
+from command_line import rows, run, words
 
 from jaxro import calibration
 from jaxro.calibration import Brown, Comparison, Field, Model, Whole

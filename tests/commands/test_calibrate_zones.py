@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from calibrate_command import SIGMA, one_image, rows, run, taken, words
+from calibrate_command import SIGMA, one_image, taken
+from command_line import rows, run, words
 
 from jaxro import calibration
 from jaxro.calibration import Model, rectangles

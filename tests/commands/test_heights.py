@@ -1,7 +1,6 @@
 """`jaxro heights` and `jaxro plan` as their user meets them: reports, files, what is
 said of bad tables."""
 
-import csv
 import json
 import re
 import sys
@@ -9,29 +8,11 @@ import sys
 import numpy as np
 import pytest
 from bad_tables import write
-from typer.testing import CliRunner
+from command_line import rows, run, words
 
-from jaxro.cli import app
 from jaxro.tables.examples import survey as example
 
 CAMERAS = ["--camera-height", str(example.CAMERA_HEIGHT), "--base", str(example.BASE)]
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
-    assert result.exception is None or isinstance(result.exception, SystemExit), (
-        result.exception
-    )
-    return result
-
-
-def words(text):
-    return " ".join(text.split())
-
-
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture

@@ -1,0 +1,24 @@
+"""Calls of the command line, and what they say and write."""
+
+import csv
+
+from typer.testing import CliRunner
+
+from jaxro.cli import app
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
+    assert result.exception is None or isinstance(result.exception, SystemExit), (
+        result.exception
+    )
+    return result
+
+
+def words(text):
+    return " ".join(text.split())
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
