@@ -87,3 +87,18 @@ def test_film_that_is_deformed_by_a_millimetre(n):
     over_one, over_brown = np.median(gains, axis=0)
     assert over_one > (4 if n == 30 else 5)
     assert over_brown > (2 if n == 30 else 2.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [40, 100])
+@pytest.mark.parametrize("distort", [film, radial, nothing])
+def test_the_choice_is_hardly_worse_than_the_best_model(n, distort):
+    """Its error in new places over the least error of all models that were tried."""
+    regrets = []
+    for seed in range(7):
+        image, places, points = images(seed, n, distort)
+        found, _ = calibration.choose(image, FEW)
+        every = (calibration.calibrate(image, model) for model in FEW)
+        errors = [error(one, places, points) for one in every]
+        regrets.append(error(found.check(), places, points) / np.nanmin(errors))
+    assert np.median(regrets) < 1.25
