@@ -1,4 +1,4 @@
-"""The command line: `jaxro orient`, `clean`, `calibrate`, `absolute`, `colmap`,
+"""The command line: `jaxro orient`, `clean`, `calibrate`, `absolute`, `block`, `colmap`,
 `compare`, `reproduce`, `heights`, `plan`.
 
 Exit code 0: every pair has usable elements; 1: at least one has not; 2: the input could
@@ -18,6 +18,7 @@ except ModuleNotFoundError:
 
 from .commands import options as given
 from .commands.absolute_line import absolute
+from .commands.block_line import block
 from .commands.calibration_line import calibrate
 from .commands.ending import end
 from .commands.options import Engine, Residual
@@ -173,6 +174,7 @@ def clean(
 
 app.command()(calibrate)
 app.command()(absolute)
+app.command()(block)
 
 
 @app.command()

@@ -8,6 +8,7 @@ A step that does not reduce the sum of squares is not taken, and λ grows (Marqu
 Gauss-Newton.
 """
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,6 +19,8 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ..xla.programs import Program, is_traced
+from ..xla.settings import COMPILE_FAST
 from . import symmetric
 
 Scalar = Float[Array, ""]
@@ -84,42 +87,52 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             if known
             else _damped(fn, y, args, state.damping)
         )
-        back = jax.tree.map(jnp.negative, found.step)
+        back = jax.tree.map(operator.neg, found.step)
         moved = args.further(y, back) if known else jax.tree.map(jnp.add, y, back)
-        squares = _squares(fn(moved, args)[0])
-        invisible = found.gain <= INVISIBLE * state.squares
-        allowed = jnp.where(invisible, (1 + MARGIN) * state.squares, state.squares)
-        taken = squares <= allowed
-        ratio = (state.squares - squares) / jnp.maximum(
-            found.gain, jnp.finfo(squares.dtype).tiny
-        )
-        good = invisible | (ratio > 0.5)
-        damping = jnp.where(
-            taken,
-            jnp.where(good, state.damping / 10, state.damping),
-            state.damping * state.growth,
-        )
-        short = found.decrement <= self.rtol**2 * state.squares + self.atol**2
-        resting = invisible & (found.decrement > state.decrement / 4)
-        hopeless = ~taken & invisible
-        choose = lambda a, b: jnp.where(taken, a, b)
-        return (
-            jax.tree.map(choose, moved, y),
-            State(
-                squares=choose(squares, state.squares),
-                damping=damping,
-                growth=jnp.where(taken, 2.0, 2 * state.growth),
-                decrement=found.decrement,
-                done=(taken & (short | resting)) | hopeless,
-            ),
-            None,
-        )
+        data = state, found, y, moved, _squares(fn(moved, args)[0])
+        lengths = {"rtol": self.rtol, "atol": self.atol}
+        if is_traced(data):
+            return *_decide(data, **lengths), None
+        # one program, where the host works between the steps
+        return *Program(_decide, lengths, COMPILE_FAST)(data), None
 
     def terminate(self, fn, y, args, options, state, tags):
         return state.done, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         return y, aux, {}
+
+
+def _decide(
+    data: tuple[State, DampedStep, PyTree, PyTree, Scalar], rtol: float, atol: float
+) -> tuple[PyTree, State]:
+    """Where the search goes on, and how: from the state, the step that is proposed, the
+    parameters `y` before and `moved` by it, and the sum of squares there."""
+    state, found, y, moved, squares = data
+    invisible = found.gain <= INVISIBLE * state.squares
+    allowed = jnp.where(invisible, (1 + MARGIN) * state.squares, state.squares)
+    taken = squares <= allowed
+    ratio = (state.squares - squares) / jnp.maximum(
+        found.gain, jnp.finfo(squares.dtype).tiny
+    )
+    good = invisible | (ratio > 0.5)
+    damping = jnp.where(
+        taken,
+        jnp.where(good, state.damping / 10, state.damping),
+        state.damping * state.growth,
+    )
+    short = found.decrement <= rtol**2 * state.squares + atol**2
+    resting = invisible & (found.decrement > state.decrement / 4)
+    hopeless = ~taken & invisible
+    choose = lambda a, b: jnp.where(taken, a, b)
+    further = State(
+        squares=choose(squares, state.squares),
+        damping=damping,
+        growth=jnp.where(taken, 2.0, 2 * state.growth),
+        decrement=found.decrement,
+        done=(taken & (short | resting)) | hopeless,
+    )
+    return jax.tree.map(choose, moved, y), further
 
 
 def promised(step: PyTree, decrement: Scalar, damping: Scalar, spread: Scalar):

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 from . import normal_equations as normal
@@ -56,21 +57,30 @@ class Term(eqx.Module):
         self.condition = condition
         self.prepare = prepare
         self.bilinear = bilinear
-        self.observations = jax.tree.map(jnp.asarray, observations)
+        self.observations = jax.tree.map(_as_array, observations)
         groups = jax.tree.leaves(self.observations)[0].shape[0]
         self.touches = tuple(
-            (name, jnp.broadcast_to(jnp.asarray(member), (groups,)))
-            for name, member in touches
+            (name, _for_each(member, groups)) for name, member in touches
         )
-        self.mask = jnp.ones(groups, bool) if mask is None else jnp.asarray(mask)
-        self.cofactor = jax.tree.map(lambda q: _for_each(q, groups), cofactor)
+        use = np.ones(groups, bool) if mask is None else mask
+        self.mask = _as_array(use)
+        each = lambda q: _for_each(q, groups, float)
+        self.cofactor = jax.tree.map(each, cofactor)
 
 
-def _for_each(q: ArrayLike, groups: int) -> Array:
-    """A variance of every group, from one for all or one for each."""
-    q = jnp.asarray(q)
-    q = q if jnp.issubdtype(q.dtype, jnp.floating) else q.astype(float)
-    return jnp.broadcast_to(q, (groups, *q.shape[1:]))
+def _as_array(a: ArrayLike) -> Array:
+    """An array of JAX; of one of NumPy without a program for its shape."""
+    return a if isinstance(a, jax.Array) else jax.device_put(np.asarray(a))
+
+
+def _for_each(a: ArrayLike, groups: int, kind: type | None = None) -> Array:
+    """Something for every group, from one for all or one for each; of `kind`, unless
+    its numbers are real."""
+    xp = jnp if isinstance(a, jax.Array) else np
+    a = xp.asarray(a)
+    if kind is not None and not xp.issubdtype(a.dtype, xp.floating):
+        a = a.astype(kind)
+    return _as_array(xp.broadcast_to(a, (groups, *a.shape[1:])))
 
 
 def close(term: Term, *parameters: PyTree) -> Term:

@@ -81,6 +81,15 @@ DATUM = ("scale", "turn", "tilt", "height", "shift")
 """What control determines: the scale, the turn about the vertical, the tilt of the
 horizon, and the shift in height and in plan."""
 
+MEASURE = {
+    "scale": "scale (a second point known in plan)",
+    "turn": "turn about the vertical (a second point known in plan)",
+    "tilt": "tilt (heights of three points that are not on one line)",
+    "height": "height (a point of known height)",
+    "shift": "shift in plan (a point known in plan)",
+}
+"""What is missing, and what would give it."""
+
 
 class Evidence(NamedTuple):
     """What the verdict on a solution rests on.
@@ -114,6 +123,16 @@ def is_usable(result: RESULTS) -> Bool[Array, "..."]:
         | (result == RESULTS.no_redundancy)
         | (result == RESULTS.two_solutions)
     )
+
+
+def advice_of(result: RESULTS, missing: Bool[np.ndarray, "5"]) -> str:
+    """What a result says, without the names of Python, and what would give what is
+    `missing` of the datum."""
+    text = RESULTS[result].replace(" `missing` tells what they leave open.", "")
+    text = text.replace(" `solutions` returns both.", "")
+    there = zip(DATUM, missing.tolist(), strict=True)
+    measure = [MEASURE[name] for name, is_missing in there if is_missing]
+    return f"{text} Missing: {', '.join(measure)}." if measure else text
 
 
 def verdict(evidence: Evidence) -> RESULTS:

@@ -151,6 +151,20 @@ class BlockAdjustment:
         return self._of_rays(white * self.block.sigma[used][:, None] * sign)
 
     @property
+    def misfits(self) -> Float[np.ndarray, "ray 2"]:
+        """Place of the adjusted point minus measured place, of all rays: the
+        `residuals`, and what they would be of the rays that were left out."""
+        from scipy.spatial.transform import Rotation
+
+        block, photo = self.block, self.block.photo
+        w, x, y, z = np.asarray(self.stations.quaternion).T
+        turn = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
+        away = self.coordinates[block.point] - self.centres[photo]
+        at = np.einsum("rij,rj->ri", turn[photo], away)
+        plane = at[:, :2] / at[:, 2:] * block.focal[photo, None] * np.array([1, -1])
+        return plane - np.stack([block.x, block.y], axis=1)
+
+    @property
     def redundancy(self) -> Float[np.ndarray, "ray 2"]:
         """The redundancy numbers of x and y of each ray."""
         return self._of_rays(np.asarray(self.adjustment.redundancy[0]))

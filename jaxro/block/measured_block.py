@@ -14,8 +14,12 @@ from jaxtyping import ArrayLike, Bool, Float, Int
 from ..batches.ragged import Ragged
 
 AGREE = 1e-9
-"""Relative difference up to which two places of a point on a photo are one
+"""Part of the focal length up to which two places of a point on a photo are one
 measurement."""
+
+APART = 0.01
+"""Part of the focal length from which on two places of one name on a photo are two
+points."""
 
 
 class MeasuredBlock(NamedTuple):
@@ -88,8 +92,8 @@ def from_pairs(
     the `points` of all rows.
 
     A place that several pairs share is one measurement. Two places of a point on one
-    photo that differ are two measurements of it. Raises ValueError where a photo has
-    two focal lengths.
+    photo that differ are two measurements of it; `TwoPoints` is raised where they are
+    too far apart for that, ValueError where a photo has two focal lengths.
     """
     photos, both = np.unique(np.array([left, right]), return_inverse=True)
     both = both.reshape(2, -1)
@@ -105,15 +109,73 @@ def from_pairs(
     keys = np.stack([photo, point, np.round(x / unit), np.round(y / unit)])
     _, first = np.unique(keys, axis=1, return_index=True)
     first.sort()
-    return MeasuredBlock(
-        photos=tuple(str(name) for name in photos),
-        points=tuple(str(name) for name in names),
-        photo=photo[first],
-        point=point[first],
-        x=x[first],
-        y=y[first],
-        sigma=sigma[first],
-        focal=focal,
+    return check_names(
+        MeasuredBlock(
+            photos=tuple(str(name) for name in photos),
+            points=tuple(str(name) for name in names),
+            photo=photo[first],
+            point=point[first],
+            x=x[first],
+            y=y[first],
+            sigma=sigma[first],
+            focal=focal,
+        )
+    )
+
+
+def check_names(block: MeasuredBlock) -> MeasuredBlock:
+    """The block. Raises `TwoPoints` where two places on a photo have the name of one
+    point and are too far apart to be two measurements of it."""
+    order = np.lexsort((block.point, block.photo))
+    photo, point = block.photo[order], block.point[order]
+    first = np.flatnonzero(np.diff(photo, prepend=-1) | np.diff(point, prepend=-1))
+    extent = lambda a: np.maximum.reduceat(a, first) - np.minimum.reduceat(a, first)
+    apart = np.hypot(extent(block.x[order]), extent(block.y[order]))
+    far = np.flatnonzero(apart > APART * block.focal[photo[first]])
+    if len(far):
+        at = first[far[0]]
+        raise TwoPoints(block.photos[photo[at]], block.points[point[at]], apart[far[0]])
+    return block
+
+
+class TwoPoints(ValueError):
+    """Two points of a photo have one name."""
+
+    def __init__(self, photo: str, point: str, apart: float):
+        self.photo, self.point, self.apart = photo, point, float(apart)
+        super().__init__(
+            f"photo {photo!r} has two points with the name {point!r}, {apart:.3g} "
+            "apart: rename one of them in all pairs where it is meant"
+        )
+
+
+def add_rays(
+    block: MeasuredBlock,
+    photos: Sequence[str],
+    points: Sequence[str],
+    places: Float[ArrayLike, "ray 2"],
+    sigma: Float[ArrayLike, " ray"],
+) -> MeasuredBlock:
+    """The block with further rays, such as known points that one photo shows; points
+    may be new. Raises ValueError for a photo that the block has not got, and
+    `TwoPoints`."""
+    of_photo = {name: k for k, name in enumerate(block.photos)}
+    of_point = {name: k for k, name in enumerate(block.points)}
+    for name in photos:
+        if name not in of_photo:
+            raise ValueError(f"add_rays: the block has no photo {name!r}")
+    for name in points:
+        of_point.setdefault(name, len(of_point))
+    at = np.asarray(places, float)
+    return check_names(
+        block._replace(
+            points=tuple(of_point),
+            photo=np.append(block.photo, [of_photo[name] for name in photos]),
+            point=np.append(block.point, [of_point[name] for name in points]),
+            x=np.append(block.x, at[:, 0]),
+            y=np.append(block.y, at[:, 1]),
+            sigma=np.append(block.sigma, np.asarray(sigma, float)),
+        )
     )
 
 

@@ -19,9 +19,6 @@ from ..adjustment import Term
 from ..calibration.camera import Camera, Measured, Station, misfit, perspective
 from .measured_block import Ground, MeasuredBlock
 
-FIXED = 1e-6
-"""Standard deviations below this part of the smallest other one are raised to it."""
-
 
 class Start(NamedTuple):
     """Approximate values on the ground: quaternions of the rotations (w, x, y, z,

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from ..batches.ragged import Ragged, clean_ragged
 from ..rejection import Recommended, Rejection
@@ -16,12 +17,13 @@ from .wrong import Wrong, adjust_without_wrong
 
 
 class OrientedBlock(NamedTuple):
-    """The adjusted block; what was left out as wrong; and how its known points fitted
-    before the adjustment (None: a free network)."""
+    """The adjusted block; what was left out as wrong; how its known points fitted
+    before the adjustment (None: a free network); and which pairs could be oriented."""
 
     adjusted: BlockAdjustment
     wrong: Wrong
     placed: Placed | None
+    usable: Bool[np.ndarray, " pair"]
 
 
 def orient_block(
@@ -31,21 +33,24 @@ def orient_block(
     points: Sequence[str],
     ground: Ground | None = None,
     more: MeasuredBlock | None = None,
+    level: float = 0.05,
 ) -> OrientedBlock:
     """Orient the pairs without their wrong points, chain them, place them on the ground,
     and adjust everything, without what is wrong.
 
     `left`, `right`: the photos of each pair, in any order and direction; `points`: the
     names of all rows of `pairs`; `more`: the block with further rays, such as known
-    points on one photo. Without `ground` the network is free, its base lengths as the
+    points on one photo; `level`: the probability that anything is called wrong if
+    nothing is. Without `ground` the network is free, its base lengths as the
     chain has them. Raises `Unjoined` and `TooLittleControl` with what is missing.
     """
     block = from_pairs(left, right, pairs, points) if more is None else more
     number = {name: k for k, name in enumerate(block.photos)}
+    oriented = Oriented(*clean_ragged(pairs, Recommended(), select=_read)[0])
     models = models_of(
         np.array([number[name] for name in left]),
         np.array([number[name] for name in right]),
-        Oriented(*clean_ragged(pairs, Recommended(), select=_read)[0]),
+        oriented,
     )
     chained = chain(block, models)
     placed = None
@@ -54,10 +59,11 @@ def orient_block(
         chained = on_ground(chained, placed)
         at = np.where(placed.wrong[:, None], np.nan, ground.coordinates)
         ground = ground._replace(coordinates=at)
-    adjusted, wrong = adjust_without_wrong(block, start_from(block, chained), ground)
+    start = start_from(block, chained)
+    adjusted, wrong = adjust_without_wrong(block, start, ground, level)
     if placed is not None:
         wrong = wrong._replace(control=wrong.control | placed.wrong[:, None])
-    return OrientedBlock(adjusted, wrong, placed)
+    return OrientedBlock(adjusted, wrong, placed, np.asarray(oriented.usable))
 
 
 def _read(rejection: Rejection) -> tuple[tuple, tuple]:

@@ -1,9 +1,10 @@
-"""A chained block on the ground, by three-point consensus.
+"""A chained block on the ground, by three-point consensus, or where fewer than three
+points have all coordinates by all coordinates that are known (`absolute`).
 
-Three known points determine a similarity; the one that fits half of the known points
-best is taken. Known points that do not fit it at all have wrong coordinates, or the
-name of another point: after an adjustment, which bends the block to them, no test would
-name them.
+Three known points determine a similarity; the one with the smallest sum of the roots of
+all distances is taken, which one wrong point hardly changes. Known points that do not
+fit it at all have wrong coordinates, or the name of another point: after an adjustment,
+which bends the block to them, no test would name them.
 """
 
 from itertools import combinations
@@ -12,6 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from . import absolute
+from .absolute_model import model as measured_model
+from .absolute_verdict import RESULTS, advice_of
 from .chain import Chained, intersect
 from .measured_block import Ground, MeasuredBlock
 
@@ -44,8 +48,8 @@ class Placed(NamedTuple):
 
 
 class TooLittleControl(ValueError):
-    """Fewer than three known points, all of them on one line, or hardly one that fits
-    the photos."""
+    """Known coordinates that do not place a block: too few, on one line, with two
+    positions that both fit, or hardly one that fits the photos."""
 
 
 def place(
@@ -60,10 +64,7 @@ def place(
     at = np.where(ground.check[:, None], np.nan, ground.coordinates)
     whole = np.flatnonzero(np.all(np.isfinite(model) & np.isfinite(at), axis=1))
     if len(whole) < 3:
-        raise TooLittleControl(
-            f"{len(whole)} known points with three coordinates are on two photos or "
-            "more; three are needed to place a block"
-        )
+        return _by_all_coordinates(model, at)
     triples = _triples(whole, seed)
     rotation, scale, shift = _similarities(model[triples], at[triples])
     moved = scale[:, None, None] * np.einsum("tij,kj->tki", rotation, model)
@@ -71,12 +72,11 @@ def place(
     known = np.any(np.isfinite(apart), axis=2)
     distance = np.sqrt(np.nansum(apart**2, axis=2))
     distance = np.where(known, distance, np.nan)
-    # half of the points, and no fewer than four: three fit anyway
-    of_half = np.sort(distance[:, whole], axis=1)
-    half = min(len(whole) - 1, max(3, len(whole) // 2))
-    middle = np.where(np.isfinite(of_half[:, half]), of_half[:, half], np.inf)
-    best = int(np.argmin(middle))
-    if not np.isfinite(middle[best]) or _is_line(at[whole], ground.sigma[whole]):
+    # the sum of roots: many points that fit well count more than few that do not
+    roots = np.sum(np.sqrt(distance[:, whole]), axis=1)
+    roots = np.where(np.isfinite(roots), roots, np.inf)
+    best = int(np.argmin(roots))
+    if not np.isfinite(roots[best]) or _is_line(at[whole], ground.sigma[whole]):
         raise TooLittleControl(
             "the known points lie on one line, about which the block can turn; one "
             "point away from it is needed"
@@ -94,6 +94,33 @@ def place(
         shift=shift,
         apart=np.where(known[best], left, np.nan),
         wrong=wrong,
+    )
+
+
+def _by_all_coordinates(
+    model: Float[np.ndarray, "known 3"], at: Float[np.ndarray, "known 3"]
+) -> Placed:
+    """The similarity for all known coordinates at once, from points known in plan, in
+    height or in both; none is called wrong."""
+    there = np.all(np.isfinite(model), axis=1) & np.any(np.isfinite(at), axis=1)
+    if not np.any(there):
+        raise TooLittleControl("no known point is on two photos or more")
+    found = absolute.orient_model(measured_model(model[there], at[there]))
+    if bool(found.result == RESULTS.two_solutions):
+        raise TooLittleControl(
+            "The known coordinates fit the block in two positions equally well. Measure "
+            "a further one."
+        )
+    if not bool(found.usable):
+        raise TooLittleControl(advice_of(found.result, np.asarray(found.missing)))
+    placed = float(found.scale) * model @ np.asarray(found.rotation).T
+    apart = np.sqrt(np.nansum((placed + np.asarray(found.shift) - at) ** 2, axis=1))
+    return Placed(
+        rotation=np.asarray(found.rotation),
+        scale=float(found.scale),
+        shift=np.asarray(found.shift),
+        apart=np.where(there, apart, np.nan),
+        wrong=np.zeros(len(at), bool),
     )
 
 

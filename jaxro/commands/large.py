@@ -212,6 +212,7 @@ def _plan(
     cameras.of_all(
         scan.names,
         str(table.path),
+        photos=scan.photos,
         one_sigma=known,
         place=lambda number: table.place(int(scan.begins[number])),
     )
@@ -258,7 +259,8 @@ def _sample(table: parquet.Source, scan: parquet.Scan, cameras: Cameras) -> Ragg
     runs = []
     for first in np.linspace(0, count - run, places).astype(int):
         part = table.read(scan.begins[first : first + run + 1])
-        runs.append(to_ragged(part, cameras.of_all(part.names, part.file), 1.0))
+        both = cameras.of_all(part.names, part.file, photos=part.photos)
+        runs.append(to_ragged(part, both, 1.0))
     return concatenate(runs)
 
 

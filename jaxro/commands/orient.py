@@ -92,7 +92,11 @@ def prepare(
     check_numbers(options, table.has_sigma, table.file, system)
     sigma_known = table.has_sigma or options.sigma is not None
     cameras = known.of_all(
-        table.names, table.file, one_sigma=sigma_known, place=table.first_line
+        table.names,
+        table.file,
+        photos=table.photos,
+        one_sigma=sigma_known,
+        place=table.first_line,
     )
     noise = None
     if options.sigma == deviation.AUTO:

@@ -66,7 +66,7 @@ class Worker:
         """The part read, worked on and written; its line for the journal."""
         work = self._work
         table = self._source.read(part.begins)
-        cameras = work.cameras.of_all(table.names, table.file)
+        cameras = work.cameras.of_all(table.names, table.file, photos=table.photos)
         pairs = to_ragged(table, cameras, work.sigma)
         found = solve(pairs, work.task, work.plan, self._threads, told)
         results = make_results(table, cameras, found, work.task, work.units)

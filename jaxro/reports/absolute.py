@@ -6,9 +6,10 @@ from rich.markup import escape
 
 from ..adjustment import critical_values as critical
 from ..block.absolute_result import NAMES
-from ..block.absolute_verdict import DATUM, RESULTS
-from .absolute_files import AXES, Compared, Done
-from .pair import digits, join_names, left_out, table, worst
+from ..block.absolute_verdict import RESULTS, advice_of
+from .absolute_files import Done
+from .control import AXES, add_rows, in_words
+from .pair import digits, join_names, left_out, table
 from .reliability import DOUBTFUL
 from .text import number
 
@@ -17,15 +18,6 @@ POORLY = 0.1
 
 SHOWN = 10
 """Names that a sentence tells of a longer list."""
-
-MEASURE = {
-    "scale": "scale (a second point known in plan)",
-    "turn": "turn about the vertical (a second point known in plan)",
-    "tilt": "tilt (heights of three points that are not on one line)",
-    "height": "height (a point of known height)",
-    "shift": "shift in plan (a point known in plan)",
-}
-"""What is missing, and what would give it."""
 
 
 def show(console: Console, done: Done) -> None:
@@ -77,26 +69,14 @@ def _verdict(done: Done) -> str:
 
 def advice(done: Done) -> str:
     """What to do about control that is not enough, or not suitable."""
-    open_ = zip(DATUM, done.first.missing.tolist(), strict=True)
-    missing = [MEASURE[name] for name, is_open in open_ if is_open]
-    # the names of a user's options in place of those of Python
-    text = RESULTS[done.first.result].replace(
-        " `missing` tells what they leave open.", ""
-    )
-    return f"{text} Missing: {', '.join(missing)}." if missing else text
+    return advice_of(done.first.result, np.asarray(done.first.missing))
 
 
 def _fits(done: Done) -> str:
-    text = f"The model fits its control within {_in_words(done, done.control)}"
+    text = f"The model fits its control within {in_words(done.control, done.unit)}"
     if done.checks.names:
-        text += f", and the check points within {_in_words(done, done.checks)}"
+        text += f", and the check points within {in_words(done.checks, done.unit)}"
     return f"{text} (root mean squares)."
-
-
-def _in_words(done: Done, one: Compared) -> str:
-    found = zip(AXES, one.rms(), strict=True)
-    told = [f"{axis} {number(r, digits(r, 1))}" for axis, r in found if np.isfinite(r)]
-    return f"{', '.join(told)} {done.unit}"
 
 
 def accuracy(done: Done) -> str:
@@ -148,7 +128,7 @@ def _control(console: Console, done: Done) -> None:
         f"largest {w}, limit {number(done.limit, 2)}"
     )
     rows = table("point", "vX", "vY", "vZ", "rX", "rY", "rZ", w, title=title)
-    _add_rows(rows, done.control, done.limit, done.redundancy)
+    add_rows(rows, done.control, done.limit, done.redundancy)
     console.print(rows)
     left_out(console, len(done.control.names), "points, those with the largest shown")
 
@@ -161,29 +141,9 @@ def _checks(console: Console, done: Done) -> None:
         f"largest |d|/sd, limit {number(done.limit_of_checks, 2)}"
     )
     rows = table("point", "dX", "dY", "dZ", "|d|/sd", title=title)
-    _add_rows(rows, done.checks, done.limit_of_checks)
+    add_rows(rows, done.checks, done.limit_of_checks)
     console.print(rows)
     left_out(console, len(done.checks.names), "points, those with the largest shown")
-
-
-def _add_rows(
-    rows, one: Compared, limit: float, redundancy: np.ndarray | None = None
-) -> None:
-    sizes = np.max(np.abs(one.w), axis=1, initial=0.0)
-    decimals = max([digits(r, 1) for r in one.rms() if np.isfinite(r)], default=3)
-    cell = lambda value, there, places: number(value, places) if there else ""
-    for k in worst(list(range(len(one.names))), lambda k: -sizes[k]):
-        cells = [
-            cell(v, there, decimals)
-            for v, there in zip(one.differences[k], one.known[k], strict=True)
-        ]
-        if redundancy is not None:
-            cells += [
-                cell(r, there, 2)
-                for r, there in zip(redundancy[k], one.known[k], strict=True)
-            ]
-        style = "yellow" if sizes[k] > limit else None
-        rows.add_row(escape(one.names[k]), *cells, number(sizes[k], 2), style=style)
 
 
 def _points(console: Console, done: Done) -> None:

@@ -2,10 +2,9 @@
 absolute`, in full precision. Angles are degrees."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..adjustment import critical_values as critical
 from ..block.absolute_result import NAMES, AbsoluteOrientation
@@ -14,34 +13,9 @@ from ..tables.ground import GroundPoints
 from ..tables.model import ModelPoints
 from . import files
 from .calibration_model import limit_of_w
-
-AXES = ("X", "Y", "Z")
-LEVEL = 0.05
-"""Probability that any check coordinate exceeds its limit although none is wrong."""
+from .control import AXES, LEVEL, Compared, Row, control_rows
 
 RESULT_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
-
-Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Compared:
-    """Ground coordinates beside the places of their model points: names, given
-    coordinates, which of them there are, `differences` place minus given, and these
-    over their standard deviations (`w`)."""
-
-    names: list[str]
-    given: Float[np.ndarray, "point 3"]
-    known: Bool[np.ndarray, "point 3"]
-    differences: Float[np.ndarray, "point 3"]
-    w: Float[np.ndarray, "point 3"]
-
-    def rms(self) -> list[float]:
-        """Of the differences in X, Y, Z; NaN where there are none."""
-        return [
-            float(np.sqrt(np.mean(d[k] ** 2))) if np.any(k) else np.nan
-            for d, k in zip(self.differences.T, self.known.T, strict=True)
-        ]
 
 
 @dataclass(frozen=True)
@@ -213,16 +187,17 @@ def contents(done: Done) -> dict[str, str]:
     if done.usable:
         tables = {
             "points.csv": _points(done),
-            "control.csv": _compared(done, done.control, "control")
-            + _compared(done, done.checks, "check"),
+            "control.csv": _control(done),
             **tables,
         }
-    return {name: _text(rows) for name, rows in tables.items() if rows}
+    return {name: files.rows_text(rows) for name, rows in tables.items() if rows}
 
 
-def _text(rows: list[Row]) -> str:
-    """Rows with the same keys as CSV text."""
-    return files.csv_text([list(rows[0]), *(list(row.values()) for row in rows)])
+def _control(done: Done) -> list[Row]:
+    head = "w" if done.sigma_known else "tau"
+    none = np.full_like(done.checks.w, np.nan)
+    rows = control_rows(done.control, "control", head, done.redundancy)
+    return rows + control_rows(done.checks, "check", head, none)
 
 
 def _elements(done: Done, solution: int) -> Row:
@@ -253,19 +228,4 @@ def _points(done: Done) -> list[Row]:
         for axis, value, deviation in zip(AXES, places[k], deviations[k], strict=True):
             row |= {axis: float(value), f"s{axis}": float(deviation)}
         rows.append(row | {"role": done.roles[k]})
-    return rows
-
-
-def _compared(done: Done, one: Compared, role: str) -> list[Row]:
-    head = "w" if done.sigma_known else "tau"
-    redundancy = done.redundancy if role == "control" else np.full_like(one.w, np.nan)
-    columns = {"": one.given, "v": one.differences, "redundancy_": redundancy}
-    columns[f"{head}_"] = one.w
-    rows: list[Row] = [{"point": name, "role": role} for name in one.names]
-    for start, values in columns.items():
-        for axis, name in enumerate(AXES):
-            for row, value, known in zip(
-                rows, values[:, axis], one.known[:, axis], strict=True
-            ):
-                row[f"{start}{name}"] = float(value) if known else None
     return rows

@@ -42,12 +42,7 @@ def contents(done: Done) -> dict[str, str]:
         "difference_tests.csv": [_difference(one) for one in done.differences],
         "distances.csv": [] if done.distances is None else _distances(done.distances),
     }
-    return {name: _text(rows) for name, rows in tables.items() if rows}
-
-
-def _text(rows: list[Row]) -> str:
-    """Rows with the same keys as CSV text."""
-    return files.csv_text([list(rows[0]), *(list(row.values()) for row in rows)])
+    return {name: files.rows_text(rows) for name, rows in tables.items() if rows}
 
 
 def _pairs(names, values: np.ndarray, deviations: np.ndarray, usable: bool) -> Row:

@@ -40,7 +40,7 @@ def draw_corrections(done: Done) -> bytes:
     """A row for each camera: the corrections as arrows, and their standard deviations
     as colours; both only among the places that were measured."""
     maps = done.maps[:MOST]
-    figure = _figure(11.0, 4.8 * len(maps))
+    figure = make_figure(11.0, 4.8 * len(maps))
     down = {one.camera: bool(one.figures.y_down) for one in done.cameras}
     for row, one in zip(
         figure.subplots(len(maps), 2, squeeze=False), maps, strict=True
@@ -59,7 +59,7 @@ def draw_corrections(done: Done) -> bytes:
         figure.colorbar(drawn, ax=right, label=done.unit, shrink=0.8)
         for axes in row:
             _set_axes(axes, done.unit, down[one.camera])
-    return _png(figure)
+    return png(figure)
 
 
 def draw_residuals(done: Done) -> bytes:
@@ -67,7 +67,7 @@ def draw_residuals(done: Done) -> bytes:
     photos = [one for one in done.photos if one.usable][: 2 * MOST]
     columns = min(3, len(photos))
     lines = -(-len(photos) // columns)
-    figure = _figure(5.2 * columns, 4.6 * lines)
+    figure = make_figure(5.2 * columns, 4.6 * lines)
     every = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes in every[len(photos) :]:
         axes.set_axis_off()
@@ -75,20 +75,20 @@ def draw_residuals(done: Done) -> bytes:
         _arrows(axes, one.places, one.residuals, done.unit, f"{one.name}: residuals")
         _mark_worst(axes, done, one)
         _set_axes(axes, done.unit, bool(one.figures.y_down))
-    return _png(figure)
+    return png(figure)
 
 
 def draw_differences(done: Done) -> bytes:
     """The difference of both distortions of each pair as arrows among the places that
     both have measured; their colour is the difference in standard deviations."""
     pairs = [one for one in done.differences if one.found is not None][:MOST]
-    figure = _figure(7.0, 5.2 * len(pairs))
+    figure = make_figure(7.0, 5.2 * len(pairs))
     down = {one.name: bool(one.figures.y_down) for one in done.photos}
     every = figure.subplots(len(pairs), 1, squeeze=False).ravel()
     for axes, one in zip(every, pairs, strict=True):
         _draw_difference(axes, done, one)
         _set_axes(axes, done.unit, down[one.first])
-    return _png(figure)
+    return png(figure)
 
 
 def _draw_difference(axes: Any, done: Done, one: Compared) -> None:
@@ -112,7 +112,7 @@ def draw_variants(done: Done, rows: list[Variant]) -> bytes:
     """The score of each model behind the best one, and the error of coordinates left
     out."""
     shown = [row for row in rows if np.isfinite(row.behind)][:TRIED]
-    figure = _figure(10.0, 1.2 + 0.32 * len(shown))
+    figure = make_figure(10.0, 1.2 + 0.32 * len(shown))
     left, right = figure.subplots(1, 2, sharey=True)
     names, at = [describe(row.model) for row in shown], np.arange(len(shown))
     left.barh(at, [row.behind for row in shown])
@@ -122,10 +122,11 @@ def draw_variants(done: Done, rows: list[Variant]) -> bytes:
     right.barh(at, [row.left_out for row in shown], color="tab:orange")
     right.set_xlabel(f"error of coordinates left out, {done.unit}")
     right.locator_params(axis="x", nbins=4)
-    return _png(figure)
+    return png(figure)
 
 
-def _figure(width: float, height: float) -> Any:
+def make_figure(width: float, height: float) -> Any:
+    """An empty figure that nothing shows on a screen."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -134,7 +135,8 @@ def _figure(width: float, height: float) -> Any:
     return figure
 
 
-def _png(figure: Any) -> bytes:
+def png(figure: Any) -> bytes:
+    """A figure as PNG."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=110)
     return file.getvalue()

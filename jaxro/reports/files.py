@@ -56,6 +56,16 @@ def _cells(column: Column, values: Any) -> list[Any]:
     return found
 
 
+def rows_text(rows: Sequence[dict[str, Any]]) -> str:
+    """Rows with the same keys, which are the header, as CSV text."""
+    return csv_text([list(rows[0]), *(list(row.values()) for row in rows)])
+
+
+def columns_text(columns: dict[str, Any]) -> str:
+    """Columns of one length as CSV text."""
+    return csv_text([list(columns), *zip(*columns.values(), strict=True)])
+
+
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
     """Rows as CSV text, the first of them the header: true and false for truths, an
     empty field for what does not exist."""

@@ -173,7 +173,7 @@ TRAVERSES = (
 
 def contents(done: Done) -> dict[str, Any]:
     """The files of --out by name."""
-    texts = {"heights.csv": _text(_heights(done))}
+    texts = {"heights.csv": files.columns_text(_heights(done))}
     adjusted = done.found.adjusted
     if done.traverses and adjusted is not None:
         rows = [TRAVERSES, *map(astuple, done.traverses)]
@@ -186,7 +186,7 @@ def contents(done: Done) -> dict[str, Any]:
             "v_mm": adjusted.corrections.tolist(),
             "redundancy": adjusted.leg_redundancy.tolist(),
         }
-        texts["legs.csv"] = _text(legs)
+        texts["legs.csv"] = files.columns_text(legs)
     return texts | {"summary.json": files.json_text(summary(done))}
 
 
@@ -204,11 +204,6 @@ def _heights(done: Done) -> dict[str, Any]:
         "sd_over_grid_mm": own(found.deviations.over_grid),
         **{f"share_{name}": own(a) for name, a in found.shares._asdict().items()},
     }
-
-
-def _text(columns: dict[str, Any]) -> str:
-    """Columns as CSV text."""
-    return files.csv_text([list(columns), *zip(*columns.values(), strict=True)])
 
 
 def summary(done: Done) -> dict[str, Any]:

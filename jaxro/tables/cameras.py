@@ -40,37 +40,103 @@ class Cameras:
         Raises TableError if the name does not say which photos it is made of."""
         if self.left is not None and self.right is not None:
             return self.left, self.right
+        left, right = self.photos_in(name, file, line)
+        return self.photos[left], self.photos[right]
+
+    def photos_in(
+        self, name: str, file: str, line: int | str | None = None
+    ) -> tuple[str, str]:
+        """The two photos that the name of a pair is made of: LEFT-RIGHT or LEFT_RIGHT,
+        of photos that have a camera of their own. Raises TableError."""
         splits = [
-            (name[:i], name[i + 1 :]) for i, letter in enumerate(name) if letter in "-_"
+            (name[:i], name[i + 1 :])
+            for i, letter in enumerate(name)
+            if letter in "-_" and 0 < i < len(name) - 1
         ]
-        known = [
-            split for split in splits if all(photo in self.photos for photo in split)
-        ]
-        if len(known) != 1:
-            found = (
-                f"{name!r}"
-                if not known
-                else f"{name!r}, which can be split in {len(known)} ways"
-            )
+        if self.photos:
+            known = [s for s in splits if all(photo in self.photos for photo in s)]
             expected = (
                 f"LEFT-RIGHT or LEFT_RIGHT with two photos of {self.file}: "
                 f"{', '.join(self.photos)}"
             )
+        else:
+            # photo_1-photo_2 has one hyphen
+            known = [
+                s for s in splits if name.count("-") == 1 and "-" not in s[0] + s[1]
+            ]
+            known = known or splits
+            expected = (
+                "LEFT-RIGHT, the names of two photos, or the columns left and right "
+                "with these names"
+            )
+        if len(known) != 1 or known[0][0] == known[0][1]:
+            found = repr(name)
+            if len(known) > 1:
+                found += f", which can be split in {len(known)} ways"
             raise TableError(
                 file, line=line, column="pair", found=found, expected=expected
             )
-        return self.photos[known[0][0]], self.photos[known[0][1]]
+        return known[0]
+
+    def of_photo(self, name: str) -> Camera | None:
+        """The camera of a photo; None where it has none, or not one alone."""
+        return self.photos.get(name, self.left if self.left == self.right else None)
+
+    def photos_of(
+        self,
+        names: Any,
+        file: str,
+        *,
+        given: tuple[Any, Any] | None = None,
+        place: Callable[[int], int | str | None] = lambda number: None,
+    ) -> tuple[list[str], list[str]]:
+        """The left and the right photo of all pairs: those that are `given`, else those
+        in the names of the pairs. `place`: where the pair of a number begins in the
+        file. Raises TableError."""
+        if given is not None:
+            left, right = (list(map(str, to_list(column))) for column in given)
+            for column, photos in (("left", left), ("right", right)):
+                self._check_photos(photos, file, column, place)
+            return left, right
+        both = []
+        for number, name in enumerate(map(str, to_list(names))):
+            try:
+                both.append(self.photos_in(name, file))
+            except TableError as error:
+                raise _at(error, place(number)) from None
+        left, right = zip(*both, strict=True)
+        return list(left), list(right)
+
+    def _check_photos(
+        self,
+        photos: list[str],
+        file: str,
+        column: str,
+        place: Callable[[int], int | str | None],
+    ) -> None:
+        """Raises TableError for a photo without a camera."""
+        for number, name in enumerate(photos):
+            if self.photos and name not in self.photos:
+                raise TableError(
+                    file,
+                    line=place(number),
+                    column=column,
+                    found=repr(name),
+                    expected=f"a photo of {self.file}: {', '.join(self.photos)}",
+                )
 
     def of_all(
         self,
         names: Any,
         file: str,
         *,
+        photos: tuple[Any, Any] | None = None,
         one_sigma: bool = False,
         place: Callable[[int], int | str | None] = lambda number: None,
     ) -> CameraPairs:
         """(left, right) that all pairs have, or those of each of the names, a column.
 
+        `photos`: the names of the left and right photos, where the table has them.
         `one_sigma`: one standard deviation has to serve both photos. `place`: where the
         pair of a number begins in the file. Raises TableError.
         """
@@ -78,22 +144,25 @@ class Cameras:
             if one_sigma:
                 check_one_sigma(file, place(0), self.left, self.right)
             return self.left, self.right
+        left, right = self.photos_of(names, file, given=photos, place=place)
         each = []
-        for number, name in enumerate(map(str, to_list(names))):
-            try:
-                both = self.of(name, file)
-                if one_sigma:
-                    check_one_sigma(file, None, *both)
-            except TableError as error:
-                raise TableError(
-                    error.file,
-                    line=place(number),
-                    column=error.column,
-                    found=error.found,
-                    expected=error.expected,
-                ) from None
+        for number, (one, other) in enumerate(zip(left, right, strict=True)):
+            both = self.photos[one], self.photos[other]
+            if one_sigma and both[0].pixel_size != both[1].pixel_size:
+                check_one_sigma(file, place(number), *both)
             each.append(both)
         return each
+
+
+def _at(error: TableError, line: int | str | None) -> TableError:
+    """The error, with the line where it is."""
+    return TableError(
+        error.file,
+        line=line,
+        column=error.column,
+        found=error.found,
+        expected=error.expected,
+    )
 
 
 def read(path: Path) -> Cameras:

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.csv as arrow_csv
 
 from . import csv as tables, whole
-from .measured import COLUMNS, NUMBERS
+from .measured import COLUMNS, NUMBERS, PHOTOS
 from .parquet import BATCH, NAMES, encoding, pa, pc, pq
 
 
@@ -44,6 +44,8 @@ def _convert_quickly(source: Path, draft: Path, semicolons: bool) -> None:
         raise pa.ArrowInvalid("for the careful reader")
     COLUMNS.places(header, str(source), line)
     full = [COLUMNS.full(name) for name in header]
+    if set(PHOTOS) & set(full):
+        raise pa.ArrowInvalid("for the careful reader")
     types = {c: pa.string() if c in NAMES else pa.float64() for c in full}
     reader = arrow_csv.open_csv(
         source,
@@ -75,8 +77,10 @@ def _convert_carefully(source: Path, draft: Path, semicolons: bool) -> None:
     """Line by line, a tenth as fast. Raises TableError."""
     lines, writer = tables.lines(source, semicolons), None
     while rows := list(islice(lines, BATCH)):
-        _, pairs, points, values = zip(*rows, strict=True)
+        _, pairs, points, values, photos = zip(*rows, strict=True)
         columns = {"pair": pairs} if pairs[0] else {}
+        if photos[0]:
+            columns |= dict(zip(PHOTOS, zip(*photos, strict=True), strict=True))
         batch = pa.table(
             columns
             | {"point": points}

@@ -1,8 +1,9 @@
 """Tables of measured image coordinates: CSV text in, a `Table` of columns out, or one
 clear error.
 
-Columns, in any order: point, x_left, y_left, x_right, y_right and optionally pair,
-sigma; `id,xl,yl,xr,yr` is the short form of the first five. Coordinates and sigma are
+Columns, in any order: point, x_left, y_left, x_right, y_right and optionally pair, left
+and right (the names of the photos), sigma; `id,xl,yl,xr,yr` is the short form of the
+first five. Coordinates and sigma are
 in the units of the measurement; cameras turn them into photo coordinates. Nothing is
 skipped or guessed: whatever does not fit stops the reading with file, line and column.
 """
@@ -10,10 +11,22 @@ skipped or guessed: whatever does not fit stops the reading with file, line and 
 import io
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from . import fields
 from .fields import TableError, read_text
-from .measured import COLUMNS, NUMBERS, Measurements, Table, of_pairs
+from .measured import COLUMNS, NUMBERS, PHOTOS, Measurements, Table, of_pairs
+
+
+class Line(NamedTuple):
+    """One line of a table: its number, pair, point, the numbers of `NUMBERS` that the
+    table has, and the photos of the pair, () where it has none."""
+
+    number: int
+    pair: str
+    point: str
+    values: tuple[float, ...]
+    photos: tuple[str, ...]
 
 
 def read(path: Path, semicolons: bool = False) -> Table:
@@ -30,7 +43,7 @@ def parse(text: str, file: str, name: str, semicolons: bool = False) -> Table:
     seen: dict[str, dict[str, int]] = {}
     places: dict[tuple, str] = {}
     twins: dict[str, list[str]] = {}
-    for line, pair, point, values in check_lines(
+    for line, pair, point, values, photos in check_lines(
         io.StringIO(text, newline=""), file, name, semicolons
     ):
         first = seen.setdefault(pair, {}).setdefault(point, line)
@@ -46,7 +59,17 @@ def parse(text: str, file: str, name: str, semicolons: bool = False) -> Table:
         twin = places.setdefault((pair, *values[:4]), point)
         if twin != point:
             twins.setdefault(pair, []).append(f"{point} = {twin} (line {line})")
-        measured = pairs.setdefault(pair, Measurements(pair))
+        measured = pairs.setdefault(pair, Measurements(pair, photos=photos))
+        if measured.photos != photos:
+            raise TableError(
+                file,
+                line=line,
+                column="left",
+                found=f"the photos {' and '.join(photos)}, and on line "
+                f"{measured.lines[0]} {' and '.join(measured.photos)} for the same pair "
+                f"{pair!r}",
+                expected="the same two photos in all lines of a pair",
+            )
         measured.points.append(point)
         measured.rows.append(values)
         measured.lines.append(line)
@@ -66,9 +89,7 @@ def no_points(file: str, line: int) -> TableError:
     )
 
 
-def lines(
-    path: Path, semicolons: bool = False
-) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
+def lines(path: Path, semicolons: bool = False) -> Iterator[Line]:
     """The `check_lines` lines of a file, one at a time. Raises TableError."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -79,21 +100,43 @@ def lines(
 
 def check_lines(
     text: Iterable[str], file: str, name: str = "", semicolons: bool = False
-) -> Iterator[tuple[int, str, str, tuple[float, ...]]]:
-    """(line number, pair, point, numbers) of every line below the header, each field
-    looked at. Raises TableError."""
+) -> Iterator[Line]:
+    """Every line below the header, each field looked at; `name`: of the pair, where the
+    table has neither a column for it nor for its photos. Raises TableError."""
     for line, cells in fields.lines_of(text, file, COLUMNS, semicolons):
         point = fields.name(cells["point"], file, line, "point")
-        pair = (
-            fields.name(cells["pair"], file, line, "pair") if "pair" in cells else name
-        )
+        photos = _photos(cells, file, line)
+        pair = "-".join(photos) or name
+        if "pair" in cells:
+            pair = fields.name(cells["pair"], file, line, "pair")
         numbers = (c for c in NUMBERS if c in cells)
-        yield (
-            line,
-            pair,
-            point,
-            tuple(_number(cells[c], file, line, c) for c in numbers),
+        values = tuple(_number(cells[c], file, line, c) for c in numbers)
+        yield Line(line, pair, point, values, photos)
+
+
+def _photos(cells: dict[str, str], file: str, line: int) -> tuple[str, ...]:
+    """The names of the left and the right photo. Raises TableError."""
+    there = [column for column in PHOTOS if column in cells]
+    if not there:
+        return ()
+    if len(there) == 1:
+        missing = next(column for column in PHOTOS if column not in there)
+        raise TableError(
+            file,
+            column=missing,
+            found=f"no such column beside {there[0]}",
+            expected="left and right, the names of both photos of each pair",
         )
+    left, right = (fields.name(cells[c], file, line, c) for c in PHOTOS)
+    if left == right:
+        raise TableError(
+            file,
+            line=line,
+            column="right",
+            found=f"{right!r}, as in column left",
+            expected="two photos in each pair",
+        )
+    return left, right
 
 
 def _twins(file: str, pair: str, found: list[str]) -> str:

@@ -21,7 +21,12 @@ from .fields import Columns, TableError
 from .survey_checks import Row
 
 TEXTS = ("point", "image", "camera")
-PLACES = Columns(("point", "x", "y"), ("image", "sigma", "camera"), texts=TEXTS)
+PLACES = Columns(
+    ("point", "x", "y"),
+    ("image", "sigma", "camera"),
+    {"photo": "image"},
+    texts=TEXTS,
+)
 AXES = ("x", "y", "z")
 DEVIATIONS = ("sx", "sy", "sz")
 POINTS = Columns(("point", *AXES), (*DEVIATIONS, "sigma"), texts=TEXTS)

@@ -19,10 +19,14 @@ from .fields import Columns
 
 COORDINATES = ("x_left", "y_left", "x_right", "y_right")
 
+PHOTOS = ("left", "right")
+"""Columns with the names of the photos of a pair."""
+
 COLUMNS = Columns(
     ("point", *COORDINATES),
-    ("pair", "sigma"),
+    ("pair", *PHOTOS, "sigma"),
     {"id": "point", "xl": "x_left", "yl": "y_left", "xr": "x_right", "yr": "y_right"},
+    texts=("pair", "point", *PHOTOS),
 )
 NUMBERS = (*COORDINATES, "sigma")
 
@@ -32,12 +36,14 @@ CameraPairs = tuple[Camera, Camera] | list[tuple[Camera, Camera]]
 
 @dataclass
 class Measurements:
-    """The measured points of one pair; `lines` are their lines in the file."""
+    """The measured points of one pair; `lines` are their lines in the file. `photos`:
+    the names of the left and the right one, () where the table has none."""
 
     name: str
     points: list[str] = field(default_factory=list)
     rows: list[tuple[float, ...]] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
+    photos: tuple[str, ...] = ()
 
     @property
     def coordinates(self) -> Float[np.ndarray, "4 point"]:
@@ -57,7 +63,9 @@ class Table:
     `begins[k + 1]`.
 
     `names` of the pairs; `points` and `numbers` of the rows, by the names of `NUMBERS`;
-    `lines` of the rows in CSV text; `warnings`: what a careful reader should be told.
+    `lines` of the rows in CSV text; `photos`: the names of the left and of the right
+    photo of each pair, where the table has them; `warnings`: what a careful reader
+    should be told.
     """
 
     file: str
@@ -66,6 +74,7 @@ class Table:
     points: Any
     numbers: dict[str, Any]
     lines: Int[np.ndarray, " row"] | None = None
+    photos: tuple[Any, Any] | None = None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -126,6 +135,10 @@ def of_pairs(
 ) -> Table:
     """Pairs one by one as columns."""
     rows = np.array([row for pair in pairs for row in pair.rows], np.float64)
+    photos = None
+    if pairs and pairs[0].photos:
+        left, right = zip(*(pair.photos for pair in pairs), strict=True)
+        photos = np.array(left, object), np.array(right, object)
     return Table(
         file=file,
         names=np.array([pair.name for pair in pairs], object),
@@ -133,6 +146,7 @@ def of_pairs(
         points=np.array([point for pair in pairs for point in pair.points], object),
         numbers=dict(zip(NUMBERS, rows.T.copy(), strict=False)),
         lines=np.array([line for pair in pairs for line in pair.lines], int),
+        photos=photos,
         warnings=tuple(warnings),
     )
 

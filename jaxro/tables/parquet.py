@@ -15,7 +15,7 @@ from jaxtyping import Int
 
 from . import csv as tables
 from .fields import TableError
-from .measured import COLUMNS, NUMBERS, Table
+from .measured import COLUMNS, NUMBERS, PHOTOS, Table
 
 try:
     import pyarrow as pa
@@ -26,7 +26,7 @@ except ModuleNotFoundError:
         "Parquet tables need pyarrow: pip install 'jaxro[cli,tables]'"
     ) from None
 
-NAMES = ("pair", "point")
+NAMES = ("pair", "point", *PHOTOS)
 
 DAMAGED = OSError, pa.ArrowException, UnicodeDecodeError
 """What Arrow raises for a file that is damaged."""
@@ -36,11 +36,13 @@ BATCH = 1 << 18
 
 
 class Scan(NamedTuple):
-    """Where the pairs of a table begin, with the end of the table behind them, and
-    their names, an Arrow array."""
+    """Where the pairs of a table begin, with the end of the table behind them; their
+    names, an Arrow array, and those of their left and right photos, where the table has
+    them."""
 
     begins: Int[np.ndarray, " pairs+1"]
     names: Any
+    photos: tuple[Any, Any] | None = None
 
     @property
     def lengths(self) -> Int[np.ndarray, " pair"]:
@@ -89,21 +91,37 @@ class Source:
             )
         self._check_points()
         if "pair" not in self.columns:
+            for name in PHOTOS:
+                if name in self.columns:
+                    raise TableError(
+                        self.path,
+                        column="pair",
+                        found=f"no such column beside {name}",
+                        expected="the names of the pairs",
+                    )
             return Scan(np.array([0, self.count]), pa.chunked_array([[self.path.stem]]))
-        begins, names, row, last = [], [], 0, None
-        for batch in self._file.iter_batches(BATCH, columns=[self.columns["pair"]]):
-            column = batch.column(0)
+        begins, names, photos, row, last = [], [], [], 0, None
+        wanted = [self.columns[n] for n in ("pair", *PHOTOS) if n in self.columns]
+        for batch in self._file.iter_batches(BATCH, columns=wanted):
+            column = batch.column(self.columns["pair"])
             if column.null_count:
                 self._check_names(column, "pair", np.arange(row, row + len(column)))
             starts = _runs(column, last)
             begins.append(starts + row)
             names.append(column.take(starts))
+            if len(wanted) == 3:
+                own = [batch.column(self.columns[n]).take(starts) for n in PHOTOS]
+                photos.append(own)
             row, last = row + len(column), column[-1].as_py()
         found = np.concatenate(begins)
         every = pa.chunked_array(names)
         self._check_names(every.combine_chunks(), "pair", found)
         self._once(every, found)
-        return Scan(np.append(found, row), every)
+        both = None
+        if photos:
+            left, right = map(pa.chunked_array, zip(*photos, strict=True))
+            both = left, right
+        return Scan(np.append(found, row), every, both)
 
     def _check_points(self) -> None:
         """Raises TableError for a point without a name."""
@@ -168,13 +186,33 @@ class Source:
             names = rows.column("pair").take(pa.array(own[:-1])).combine_chunks()
         else:
             names = pa.array([self.path.stem] * (len(own) - 1))
+        photos = None
+        if all(name in rows.column_names for name in PHOTOS):
+            left, right = (self._once_a_pair(rows.column(n), own, n) for n in PHOTOS)
+            photos = left, right
         return Table(
             file=str(self.path),
             names=names,
             begins=own,
             points=rows.column("point"),
             numbers={n: rows.column(n) for n in NUMBERS if n in rows.column_names},
+            photos=photos,
         )
+
+    def _once_a_pair(self, column: Any, begins: np.ndarray, name: str) -> Any:
+        """The values of the pairs, of a column with one in each row. Raises TableError
+        where a pair has several."""
+        of_pairs = column.take(pa.array(begins[:-1]))
+        owners = np.repeat(np.arange(len(begins) - 1), np.diff(begins))
+        every = of_pairs.take(pa.array(owners))
+        if not pc.all(pc.equal(column, every)).as_py():  # pyright: ignore[reportAttributeAccessIssue]
+            raise TableError(
+                self.path,
+                column=name,
+                found="several photos in the rows of one pair",
+                expected="the same two photos in all rows of a pair",
+            )
+        return of_pairs.combine_chunks()
 
     def _rows(self, begin: int, end: int) -> Any:
         """These rows as an Arrow table with the full names of the columns; one behind

@@ -1,0 +1,169 @@
+"""The command line of `jaxro block`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..tables.whole import is_parquet
+from . import options as given
+from .ending import end
+
+Control = Annotated[
+    Path | None,
+    typer.Option(
+        help="CSV table of points on the ground: point,X,Y,Z, blank where a coordinate "
+        "is not known, sX,sY,sZ or sigma, and optionally role: control, check. Without "
+        "it the block is a free network.",
+        metavar="GROUND.csv",
+        show_default=False,
+    ),
+]
+ControlSigma = Annotated[
+    float | None,
+    typer.Option(
+        help="Standard deviation of every ground coordinate, where the table has none.",
+        metavar="SD",
+        show_default=False,
+    ),
+]
+Rays = Annotated[
+    Path | None,
+    typer.Option(
+        help="CSV table of further places, such as control points on one photo: "
+        "photo,point,x,y, optionally sigma.",
+        metavar="RAYS.csv",
+        show_default=False,
+    ),
+]
+Sigma = Annotated[
+    str | None,
+    typer.Option(
+        help="Standard deviation of every image coordinate, in the units of the table."
+        "  [default: auto, that of the residuals of the pairs]",
+        metavar="SD|auto",
+        show_default=False,
+    ),
+]
+Level = Annotated[
+    float,
+    typer.Option(
+        help="Probability that anything is called wrong if nothing is.", metavar="P"
+    ),
+]
+Unit = Annotated[
+    str, typer.Option(help="Name of the unit of the ground: m, ft.", metavar="NAME")
+]
+PhotoUnit = Annotated[
+    str, typer.Option(help="Name of the unit of the photos: mm, px.", metavar="NAME")
+]
+Strips = Annotated[
+    int | None,
+    typer.Option(
+        help="Of the simulated block: its strips.  [default: 1]",
+        metavar="S",
+        min=1,
+        max=200,
+        show_default=False,
+    ),
+]
+Models = Annotated[
+    int | None,
+    typer.Option(
+        help="Of the simulated block: models of each strip.  [default: 6]",
+        metavar="M",
+        min=2,
+        max=10_000,
+        show_default=False,
+    ),
+]
+Seed = Annotated[
+    int | None,
+    typer.Option(
+        help="Of the simulated block: seed of its random numbers.  [default: 0]",
+        metavar="N",
+        min=0,
+        show_default=False,
+    ),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        "-o",
+        help="Folder for photos, points, control, residuals, covariances as CSV "
+        "(Parquet for a Parquet table), summary.json, block.png; of the simulated block "
+        "pairs.csv and ground.csv as well.",
+        metavar="DIR",
+        show_default=False,
+    ),
+]
+Parquet = Annotated[bool, typer.Option("--parquet", help="Results as Parquet tables.")]
+
+
+def block(
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Table of pairs as of jaxro orient, CSV or Parquet, with the columns "
+            "left and right (the names of the photos) or pairs named LEFT-RIGHT. Without "
+            "it a simulated block.",
+            metavar="PAIRS.csv",
+            show_default=False,
+        ),
+    ] = None,
+    control: Control = None,
+    control_sigma: ControlSigma = None,
+    rays: Rays = None,
+    camera: given.Camera = None,
+    focal: given.Focal = None,
+    principal_point: given.PrincipalPoint = None,
+    pixel_size: given.PixelSize = None,
+    y_down: given.YDown = False,
+    semicolons: given.Semicolons = False,
+    sigma: Sigma = None,
+    level: Level = 0.05,
+    unit: Unit = "m",
+    photo_unit: PhotoUnit = "mm",
+    strips: Strips = None,
+    models: Models = None,
+    seed: Seed = None,
+    out: Out = None,
+    force: given.Force = False,
+    parquet: Parquet = False,
+) -> None:
+    """Join oriented pairs of a strip or block on the ground.
+
+    Photos, points and control with standard deviations from the image measurements;
+    wrong places and wrong control named. Exit code 0: usable; 1: too much is wrong; 2:
+    bad input, nothing written.
+    """
+    from .block import Options, run
+    from .request import Options as Measured
+
+    measured = Measured(
+        file=file,
+        camera=camera,
+        focal=focal,
+        principal_point=principal_point,
+        pixel_size=pixel_size,
+        y_down=y_down,
+        sigma=sigma,
+        unit=photo_unit,
+        out=out,
+        force=force,
+        semicolons=semicolons,
+    )
+    options = Options(
+        measured=measured,
+        control=control,
+        control_sigma=control_sigma,
+        rays=rays,
+        level=level,
+        unit=unit,
+        parquet=parquet or (file is not None and is_parquet(file)),
+        strips=strips,
+        models=models,
+        seed=seed,
+    )
+    end(lambda: run(options))

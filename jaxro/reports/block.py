@@ -1,0 +1,291 @@
+"""The report of an adjusted block on the terminal: internal consistency apart from
+accuracy on the ground."""
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+
+from ..adjustment import RESULTS
+from .block_files import ANGLES
+from .block_model import Done
+from .control import AXES, add_rows, in_words
+from .pair import MOST_ROWS, digits, join_names, left_out, table, worst
+from .reliability import DOUBTFUL
+from .text import number
+
+POORLY = 0.1
+"""Redundancy below which a control coordinate is said to be poorly checked."""
+
+SHOWN = 10
+"""Names that a sentence tells of a longer list."""
+
+
+def show(console: Console, done: Done) -> None:
+    """The verdict, what fits, how accurate photos and points are, what to mind."""
+    _head(console, done)
+    console.print(_verdict(done))
+    if done.usable:
+        console.print(_consistency(done), markup=False)
+        _left_out(console, done)
+        console.print(_accuracy(done), markup=False)
+        _photos(console, done)
+        _control(console, done)
+        _checks(console, done)
+    for sentence in sentences(done):
+        console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
+
+
+def _head(console: Console, done: Done) -> None:
+    block = done.adjusted.block
+    known = done.control.known
+    plan = np.any(known[:, :2], axis=1)
+    kinds = {
+        "full": plan & known[:, 2],
+        "in plan": plan & ~known[:, 2],
+        "in height": known[:, 2] & ~plan,
+    }
+    told = ", ".join(f"{np.sum(k)} {name}" for name, k in kinds.items() if np.any(k))
+    ground = "free network" if done.ground is None else f"control {told or 'none'}"
+    checks = f"; {len(done.checks.names)} check points" if done.ground else ""
+    console.print(
+        f"[bold]Block of {escape(done.title)}[/bold], {len(block.photos)} photos in "
+        f"{len(done.pairs)} pairs, {np.sum(done.determined)} points on {len(block.x)} "
+        f"places; {ground}{checks}"
+    )
+
+
+# -------------------------------------------------------------------------------------
+# the verdict
+
+
+def _verdict(done: Done) -> str:
+    """Whether the numbers may be used, in one sentence."""
+    if done.adjusted.result != RESULTS.successful:
+        return f"[bold red]not usable[/bold red]: {RESULTS[done.adjusted.result]}"
+    if not done.usable:
+        return (
+            "[bold red]not settled[/bold red]: residuals beyond their limit are left "
+            "after many rounds of tests; too much of the block is wrong"
+        )
+    return f"[green]{escape(_fits(done))}[/green]"
+
+
+def _fits(done: Done) -> str:
+    """The photos, and the ground if there is any, in one sentence."""
+    if done.ground is None:
+        return "The photos fit each other; nothing is known of the ground."
+    text = f"The photos fit the control within {in_words(done.control, done.unit)}"
+    if done.checks.names:
+        text += f", and the check points within {in_words(done.checks, done.unit)}"
+    return f"{text} (root mean squares)."
+
+
+def _consistency(done: Done) -> str:
+    """Internal consistency: sigma0 with its test."""
+    adjusted = done.adjusted
+    freedom = adjusted.degrees_of_freedom
+    if freedom == 0:
+        return "Internal consistency: no sigma0, 0 degrees of freedom"
+    sigma0 = adjusted.sigma0
+    return (
+        f"Internal consistency: sigma0 {number(sigma0, digits(sigma0, 2))}, {freedom} "
+        f"degrees of freedom, probability beside 1: {done.chance:.2g} ({done.sigma})"
+    )
+
+
+def _left_out(console: Console, done: Done) -> None:
+    """What was left out as wrong."""
+    rays, control = done.left_out, _wrong_control(done)
+    if not rays and not control:
+        console.print("Nothing was left out as wrong.")
+        return
+    if control:
+        console.print(
+            f"[yellow]Control points left out as wrong:[/yellow] "
+            f"{join_names(control, SHOWN)}"
+        )
+    if not rays:
+        return
+    block = done.adjusted.block
+    title = (
+        f"{len(rays)} of {len(block.x)} places left out as wrong: adjusted minus "
+        f"measured [{done.photo_unit}]"
+    )
+    rows = table("photo", "point", "v x", "v y", "|v|/sd", title=title)
+    rows.columns[1].justify = "left"
+    for one in rays[:MOST_ROWS]:
+        photo = block.photos[block.photo[one.ray]]
+        point = block.points[block.point[one.ray]]
+        cells = [number(value, 4) for value in one.misfit]
+        rows.add_row(escape(photo), escape(point), *cells, number(one.ratio, 1))
+    console.print(rows)
+    left_out(console, len(rays), "places, the worst ones shown")
+
+
+def _wrong_control(done: Done) -> list[str]:
+    wrong = np.any(done.wrong_control & done.control.known, axis=1)
+    return [done.control.names[k] for k in np.flatnonzero(wrong)]
+
+
+def _accuracy(done: Done) -> str:
+    """Standard deviations of all points."""
+    there = np.flatnonzero(done.determined)
+    deviations = done.adjusted.deviations[there]
+    rms = [number(a, digits(a, 1)) for a in np.sqrt(np.mean(deviations**2, axis=0))]
+    k = int(np.argmax(np.max(deviations, axis=1)))
+    most = float(np.max(deviations[k]))
+    name = done.adjusted.block.points[there[k]]
+    return (
+        f"Accuracy: standard deviations of the points X {rms[0]}, Y {rms[1]}, Z "
+        f"{rms[2]} {done.unit} (root mean square), the weakest of {name} with "
+        f"{number(most, digits(most, 1))}"
+    )
+
+
+# -------------------------------------------------------------------------------------
+# tables
+
+
+def _photos(console: Console, done: Done) -> None:
+    adjusted = done.adjusted
+    centres, of_centres = adjusted.centres, adjusted.centre_deviations
+    angles, of_angles = (
+        np.degrees(a) for a in (adjusted.angles, adjusted.angle_deviations)
+    )
+    least = digits(float(np.median(of_centres)), 1), digits(float(np.median(of_angles)))
+    heads = [f"{a} ± sd" for a in (*AXES, *ANGLES)]
+    title = f"Photos [{done.unit}, °]"
+    rows = table("photo", *heads, "places", title=title)
+    weak = np.max(of_centres, axis=1)
+    for k in worst(list(range(len(weak))), lambda k: -weak[k]):
+        values = np.concatenate([centres[k], angles[k]])
+        spread = np.concatenate([of_centres[k], of_angles[k]])
+        places = [least[0]] * 3 + [least[1]] * 3
+        cells = [
+            f"{number(value, d)} ± {number(s, d)}"
+            for value, s, d in zip(values, spread, places, strict=True)
+        ]
+        name = escape(adjusted.block.photos[k])
+        rows.add_row(name, *cells, str(done.points_of_photos[k]))
+    console.print(rows)
+    left_out(console, len(weak), "photos, the weakest shown")
+
+
+def _control(console: Console, done: Done) -> None:
+    if not done.control.names:
+        return
+    limit = done.tested.limit
+    title = (
+        f"Control: adjusted minus given [{done.unit}], redundancy r;\n"
+        f"largest |w|, limit {number(limit, 2)}"
+    )
+    heads = ("dX", "dY", "dZ", "r X", "r Y", "r Z", "|w|")
+    rows = table("point", *heads, title=title)
+    add_rows(rows, done.control, limit, done.control_redundancy)
+    console.print(rows)
+    left_out(console, len(done.control.names), "points, those with the largest shown")
+
+
+def _checks(console: Console, done: Done) -> None:
+    if not done.checks.names:
+        return
+    title = (
+        f"Check points: adjusted minus given [{done.unit}];\n"
+        f"largest |d|/sd, limit {number(done.limit_of_checks, 2)}"
+    )
+    rows = table("point", "dX", "dY", "dZ", "|d|/sd", title=title)
+    add_rows(rows, done.checks, done.limit_of_checks)
+    console.print(rows)
+    left_out(console, len(done.checks.names), "points, those with the largest shown")
+
+
+# -------------------------------------------------------------------------------------
+# what to mind
+
+
+def sentences(done: Done) -> list[str]:
+    """What a careful user should know of the result."""
+    said = _of_pairs(done)
+    if done.usable:
+        said += _of_fit(done) + _of_control(done) + _of_checks(done)
+    if done.strange:
+        names = join_names(done.strange, SHOWN)
+        said.append(f"No photo shows these points of the ground: {names}.")
+    if done.lonely:
+        names = join_names(done.lonely, SHOWN)
+        said.append(
+            f"{len(done.lonely)} points are on one photo only, or lost the places that "
+            f"determined them, and have no coordinates: {names}."
+        )
+    if done.approximate:
+        said.append(
+            f"{done.approximate} approximate points are not used: no approximate values "
+            "are needed."
+        )
+    return said
+
+
+def _of_pairs(done: Done) -> list[str]:
+    failed = np.flatnonzero(~done.oriented.usable)
+    if not failed.size:
+        return []
+    names = join_names([done.pairs[k] for k in failed], SHOWN)
+    return [
+        f"{len(failed)} pairs could not be oriented by themselves and served as places "
+        f"of points only: {names}. jaxro clean tells why."
+    ]
+
+
+def _of_fit(done: Done) -> list[str]:
+    freedom, sigma0 = done.adjusted.degrees_of_freedom, done.adjusted.sigma0
+    if freedom == 0 or done.chance >= DOUBTFUL:
+        return []
+    if sigma0 > 1:
+        return [
+            f"The residuals are {sigma0:.2f} times as large as the standard deviations "
+            f"say (probability {done.chance:.1g}): these are too small, or the camera is "
+            "not what was given."
+        ]
+    return [
+        f"The residuals are {1 / sigma0:.2f} times smaller than the standard deviations "
+        f"say (probability {done.chance:.1g}): these are too large."
+    ]
+
+
+def _of_control(done: Done) -> list[str]:
+    if done.ground is None:
+        return [
+            "Without known points the block has any position and scale; standard "
+            "deviations refer to its stations as a whole (inner constraints)."
+        ]
+    used = done.control.known & ~done.wrong_control
+    poorly = used & (done.control_redundancy < POORLY)
+    if not np.any(poorly):
+        return []
+    named = [
+        f"{AXES[axis]} of {done.control.names[k]}" for k, axis in np.argwhere(poorly)
+    ]
+    return [
+        f"Poorly checked (redundancy below {POORLY}), an error there hardly shows: "
+        f"{join_names(named, SHOWN)}. Each moves the block; more control beside them "
+        "would check them."
+    ]
+
+
+def _of_checks(done: Done) -> list[str]:
+    if done.ground is None:
+        return []
+    if not done.checks.names:
+        return [
+            "No check points: the residuals say how well photos and control fit "
+            "together, not how accurate new points are. Give some points of the ground "
+            "the role check."
+        ]
+    sizes, limit = np.abs(done.checks.w), done.limit_of_checks
+    beyond = np.flatnonzero(np.max(sizes, axis=1) > limit)
+    if not beyond.size:
+        return []
+    names = join_names([done.checks.names[k] for k in beyond], SHOWN)
+    return [
+        f"Check points differ by more than their standard deviations allow: {names}."
+    ]
