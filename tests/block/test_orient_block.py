@@ -257,7 +257,7 @@ def test_parts_without_a_common_scale_are_refused():
 def test_too_little_control_is_refused():
     mock = block.mock_block(6)
     few = block.ground(mock.ground.points[:2], mock.ground.coordinates[:2], 0.02)
-    with pytest.raises(block.TooLittleControl, match="2 known points"):
+    with pytest.raises(block.TooLittleControl, match="Fewer than seven"):
         block.place(mock.block, mock.photos, few)
 
 
