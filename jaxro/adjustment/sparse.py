@@ -155,7 +155,7 @@ def prepare(
     groups = tuple(len(term.mask) for term in terms)
     terms = tuple(_term_with_room(term) for term in terms)
     large = (eliminate, linked)
-    families |= {name: _with_room(families[name]) for name in large}
+    families |= {name: with_room(families[name]) for name in large}
     common = [b for b in blocks.blocks if b.name not in large]
     sizes = [b.members * b.size for b in common]
     point, block, use, direct = [], [], [], []
@@ -191,7 +191,7 @@ def prepare(
     return Problem(data, roles, slots, levels, groups, members)
 
 
-def _with_room(tree: Any) -> Any:
+def with_room(tree: Any) -> Any:
     """All leaves with more rows, which repeat the first one."""
 
     def longer(a: ArrayLike) -> np.ndarray:
@@ -205,7 +205,7 @@ def _with_room(tree: Any) -> Any:
 
 def _term_with_room(term: Term) -> Term:
     """The term with more groups, which are not in use."""
-    longer = _with_room(
+    longer = with_room(
         (term.observations, term.cofactor, [member for _, member in term.touches])
     )
     observations, cofactor, touched = longer

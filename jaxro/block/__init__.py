@@ -9,6 +9,7 @@ from .absolute_model import (
 from .absolute_result import AbsoluteOrientation as AbsoluteOrientation
 from .adjust import BlockAdjustment as BlockAdjustment, adjust_block as adjust_block
 from .chain import Unjoined as Unjoined, chain as chain, models_of as models_of
+from .inner import Inner as Inner
 from .measured_block import (
     Ground as Ground,
     MeasuredBlock as MeasuredBlock,

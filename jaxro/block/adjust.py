@@ -1,5 +1,6 @@
 """Adjust a block, and read photos, points and control from the solution."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -18,21 +19,28 @@ from ..adjustment.sparse import (
     minimise,
     prepare,
     read,
+    trimmed,
+    with_room,
 )
 from ..calibration.camera import Station
 from ..geometry import rotations as rot
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .datum import free_datum
-from .measured_block import Ground, MeasuredBlock
+from .inner import Inner, InnerParameters, cameras_of, in_photo_units
+from .measured_block import Ground, MeasuredBlock, nothing_known
 from .network import (
     Frame,
     KnownCoordinates,
     Numbered,
     Start,
-    control_of,
     frame_of,
+    in_order,
+    known_of,
     number_points,
+    places_of,
+    ray_condition,
+    spread_known,
     terms_of,
 )
 
@@ -47,7 +55,8 @@ class BlockAdjustment:
     ground: Ground | None
     frame: Frame
     numbered: Numbered
-    known: KnownCoordinates
+    known: tuple[KnownCoordinates, ...]
+    inner: Inner | None
     adjustment: SparseAdjustment
 
     @property
@@ -133,11 +142,43 @@ class BlockAdjustment:
         """Standard deviations of the points."""
         return _deviations(self.point_covariances)
 
+    def compare(
+        self, ground: Ground
+    ) -> tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]]:
+        """Adjusted minus given coordinates of all that is known, whether it took part or
+        not, and the standard deviations of the adjusted ones; NaN where there are
+        none."""
+        number, station = ground.numbers_in(self.block), ground.station[:, None]
+        point = np.where(ground.station, 0, number)
+        photo = np.where(ground.station, number, 0)
+        of = lambda centres, points: np.where(station, centres[photo], points[point])
+        off = of(self.centres, self.coordinates) - ground.coordinates
+        spread = of(self.centre_deviations, self.deviations)
+        there = (number >= 0)[:, None]
+        return np.where(there, off, np.nan), np.where(there, spread, np.nan)
+
     @property
     def as_start(self) -> Start:
         """Stations and points, to begin another adjustment with."""
         points = np.asarray(self.adjustment.parameters["point"])
-        return _start(self.frame, self.numbered, self.stations, points)
+        inner = self.adjustment.parameters.get("camera")
+        return _start(self.frame, self.numbered, self.stations, points, inner)
+
+    # ---------------------------------------------------------------------------------
+    # cameras
+
+    @cached_property
+    def cameras(self) -> InnerParameters:
+        """The inner parameters of the cameras. Raises ValueError where none are
+        unknown."""
+        if self.inner is None:
+            raise ValueError("BlockAdjustment: no inner parameters are unknown")
+        return in_photo_units(
+            self.inner,
+            cameras_of(self.block.focal),
+            np.asarray(self.adjustment.parameters["camera"]),
+            self.sigma0**2 * self.adjustment.common_cofactor,
+        )
 
     # ---------------------------------------------------------------------------------
     # residuals
@@ -150,19 +191,23 @@ class BlockAdjustment:
         sign = np.array([-1.0, 1.0])
         return self._of_rays(white * self.block.sigma[used][:, None] * sign)
 
-    @property
+    @cached_property
     def misfits(self) -> Float[np.ndarray, "ray 2"]:
         """Place of the adjusted point minus measured place, of all rays: the
         `residuals`, and what they would be of the rays that were left out."""
-        from scipy.spatial.transform import Rotation
-
         block, photo = self.block, self.block.photo
-        w, x, y, z = np.asarray(self.stations.quaternion).T
-        turn = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
-        away = self.coordinates[block.point] - self.centres[photo]
-        at = np.einsum("rij,rj->ri", turn[photo], away)
-        plane = at[:, :2] / at[:, 2:] * block.focal[photo, None] * np.array([1, -1])
-        return plane - np.stack([block.x, block.y], axis=1)
+        points = self.frame.inside(np.nan_to_num(self.coordinates))[block.point]
+        stations = jax.tree.map(lambda a: np.asarray(a)[photo], self.stations)
+        own = ()
+        if self.inner is not None:
+            camera = cameras_of(block.focal).of_photo[photo]
+            own = (np.asarray(self.adjustment.parameters["camera"])[camera],)
+        condition = ray_condition(self.inner)
+        data = with_room((stations, *own, points, places_of(block)))
+        found = Program(_misfits, {"condition": condition}, COMPILE_FAST)(data)
+        off = np.asarray(found)[: len(photo)] * block.focal[photo, None]
+        there = self.numbered.number[block.point] >= 0
+        return np.where(there[:, None], off * np.array([-1.0, 1.0]), np.nan)
 
     @property
     def redundancy(self) -> Float[np.ndarray, "ray 2"]:
@@ -172,34 +217,24 @@ class BlockAdjustment:
     @property
     def control_residuals(self) -> Float[np.ndarray, "known 3"]:
         """What would have to be added to the known coordinates."""
-        if len(self.adjustment.residuals) < 2:
-            return self._of_control(np.zeros(0))
-        white = np.asarray(self.adjustment.residuals[1])[:, 0]
-        return self._of_control(-white * self.known.sigma[self._there])
+        white = [np.asarray(r)[:, 0] for r in self.adjustment.residuals[1:]]
+        both = zip(white, self.known, strict=True)
+        return self._of_control([r * part.sigma for r, part in both])
 
     @property
     def control_redundancy(self) -> Float[np.ndarray, "known 3"]:
         """The redundancy numbers of the known coordinates."""
-        if len(self.adjustment.redundancy) < 2:
-            return self._of_control(np.zeros(0))
-        return self._of_control(np.asarray(self.adjustment.redundancy[1])[:, 0])
-
-    @property
-    def _there(self) -> np.ndarray:
-        """The known coordinates of points in the adjustment."""
-        return self.numbered.number[self.known.point] >= 0
+        found = self.adjustment.redundancy[1:]
+        return self._of_control([np.asarray(r)[:, 0] for r in found])
 
     def _of_rays(self, values: np.ndarray) -> np.ndarray:
         out = np.full((len(self.block.photo), 2), np.nan)
         out[self.numbered.rays] = values
         return out
 
-    def _of_control(self, values: np.ndarray) -> np.ndarray:
+    def _of_control(self, values: list[np.ndarray]) -> np.ndarray:
         number = 0 if self.ground is None else len(self.ground.points)
-        out = np.full((number, 3), np.nan)
-        there = self._there
-        out[self.known.row[there], self.known.axis[there]] = values
-        return out
+        return spread_known(self.known, values, number)
 
 
 class Prepared(NamedTuple):
@@ -210,84 +245,114 @@ class Prepared(NamedTuple):
     ground: Ground | None
     frame: Frame
     numbered: Numbered
-    known: KnownCoordinates
+    known: tuple[KnownCoordinates, ...]
+    inner: Inner | None
     problem: Problem
     datum: DatumOf | None
 
     def start_at(self, found: Minimum) -> Start:
         """The stations and points of a minimum, to begin another adjustment with."""
-        families = found.problem.data.families
-        photos, points = len(self.block.photos), int(np.max(self.numbered.number)) + 1
-        station = jax.tree.map(lambda a: np.asarray(a)[:photos], families["photo"])
+        families = trimmed(found.problem.data.families, found.problem.members)
         return _start(
-            self.frame, self.numbered, station, np.asarray(families["point"])[:points]
+            self.frame,
+            self.numbered,
+            families["photo"],
+            families["point"],
+            families.get("camera"),
         )
 
 
 def _start(
-    units: Frame, numbered: Numbered, station: Station, points: np.ndarray
+    units: Frame,
+    numbered: Numbered,
+    station: Station,
+    points: np.ndarray,
+    inner: np.ndarray | None,
 ) -> Start:
     return Start(
         quaternions=np.asarray(station.quaternion),
         centres=units.outside(station.centre),
         points=numbered.spread(units.outside(points)),
+        inner=None if inner is None else np.asarray(inner),
     )
 
 
 def adjust_block(
-    block: MeasuredBlock, start: Start, ground: Ground | None = None
+    block: MeasuredBlock,
+    start: Start,
+    ground: Ground | None = None,
+    inner: Inner | None = None,
+    left_out: Bool[np.ndarray, " ray"] | None = None,
 ) -> BlockAdjustment:
     """Adjust a block from approximate stations and points.
 
-    Without known points the network is free: its datum is that of the approximate
-    stations (inner constraints). Points on one photo, of which nothing else is known,
-    are left out. Failures are values of `adjustment.result`.
+    `inner`: the inner parameters of the cameras that are unknown, too; `left_out`: rays
+    that take no part, but keep their numbers. Without known
+    coordinates the network is free: its datum is that of the approximate stations
+    (inner constraints). Points on one photo, of which nothing else is known, are left
+    out. Failures are values of `adjustment.result`.
     """
-    prepared = prepare_block(block, start, ground)
-    datum = prepared.datum
-    return conclude(prepared, minimise(prepared.problem, datum=datum))
+    prepared = prepare_block(block, start, ground, inner, left_out)
+    return conclude(prepared, minimise(prepared.problem, datum=prepared.datum))
 
 
 def prepare_block(
     block: MeasuredBlock,
     start: Start,
     ground: Ground | None = None,
+    inner: Inner | None = None,
     left_out: Bool[np.ndarray, " ray"] | None = None,
 ) -> Prepared:
     """The problem of a block at its approximate values, some rays left out."""
     units = frame_of(start)
-    none = Ground((), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
-    known = control_of(block, none if ground is None else ground)
-    of_points = np.bincount(known.point, minlength=len(block.points))
+    known = known_of(block, nothing_known() if ground is None else ground)
     use = np.ones(len(block.photo), bool) if left_out is None else ~left_out
     # a known point on one photo begins where it is known to be
-    points, at = start.points.copy(), (known.point, known.axis)
-    points[at] = np.where(np.isnan(points[at]), known.value, points[at])
+    points, of_points = start.points.copy(), known.take(~known.station)
+    at = of_points.number, of_points.axis
+    points[at] = np.where(np.isnan(points[at]), of_points.value, points[at])
     there = np.all(np.isfinite(points), axis=1)
-    numbered = number_points(block, of_points, use & there[block.point])
-    terms = terms_of(block, numbered, known, units)
+    number = known.of_points(len(block.points))
+    numbered = number_points(block, number, use & there[block.point])
+    parts = in_order(known, numbered)
     inside = jnp.asarray(units.inside(start.centres))
     stations = Station(jnp.asarray(start.quaternions), inside)
     points = units.inside(points[numbered.number >= 0])
     families = {"photo": stations, "point": points}
+    if inner is not None:
+        cameras = cameras_of(block.focal).number
+        zero = np.zeros((cameras, len(inner.free)))
+        families["camera"] = zero if start.inner is None else start.inner
+    terms = terms_of(block, numbered, parts, units, inner)
     problem = prepare(terms, families, eliminate="point", linked="photo")
-    datum = free_datum(stations) if len(terms) == 1 else None
     return Prepared(
         block=block,
         ground=ground,
         frame=units,
         numbered=numbered,
-        known=known,
+        known=parts,
+        inner=inner,
         problem=problem,
-        datum=datum,
+        datum=None if parts else free_datum(stations),
     )
 
 
 def conclude(prepared: Prepared, found: Minimum) -> BlockAdjustment:
     """The adjustment at the minimum."""
-    block, ground, units, numbered, known, _, datum = prepared
-    adjustment = read(found, datum)
-    return BlockAdjustment(block, ground, units, numbered, known, adjustment)
+    return BlockAdjustment(
+        block=prepared.block,
+        ground=prepared.ground,
+        frame=prepared.frame,
+        numbered=prepared.numbered,
+        known=prepared.known,
+        inner=prepared.inner,
+        adjustment=read(found, prepared.datum),
+    )
+
+
+def _misfits(data: tuple, condition: Callable) -> Float[Array, "ray 2"]:
+    """The misfit of each ray."""
+    return jax.vmap(condition)(*data)
 
 
 def _angles(

@@ -49,13 +49,26 @@ class MeasuredBlock(NamedTuple):
 
 
 class Ground(NamedTuple):
-    """Points of the ground that are known: NaN for a coordinate that is not; `sigma` of
-    each coordinate; `check`: known, but kept out of the adjustment, which they judge."""
+    """What is known of the ground: NaN for a coordinate that is not; `sigma` of each
+    coordinate; `check`: known, but kept out of the adjustment, which they judge;
+    `station`: of the projection centre of a photo, and not of a point."""
 
     points: tuple[str, ...]
     coordinates: Float[np.ndarray, "known 3"]
     sigma: Float[np.ndarray, "known 3"]
     check: Bool[np.ndarray, " known"]
+    station: Bool[np.ndarray, " known"]
+
+    def numbers_in(self, block: MeasuredBlock) -> Int[np.ndarray, " known"]:
+        """The numbers of its points and photos in a block, -1 where it has not got
+        them."""
+        point = {name: k for k, name in enumerate(block.points)}
+        photo = {name: k for k, name in enumerate(block.photos)}
+        both = zip(self.points, self.station, strict=True)
+        found = [
+            (photo if of_photo else point).get(name, -1) for name, of_photo in both
+        ]
+        return np.array(found, int)
 
 
 def ground(
@@ -63,13 +76,17 @@ def ground(
     coordinates: Float[ArrayLike, "known 3"],
     sigma: Float[ArrayLike, "..."],
     check: Bool[ArrayLike, " known"] | None = None,
+    station: Bool[ArrayLike, " known"] | None = None,
 ) -> Ground:
-    """Known points. Raises ValueError for a name that occurs twice, and for standard
-    deviations that are not positive."""
+    """Known points, and stations that are known, too. Raises ValueError for a name that
+    occurs twice, and for standard deviations that are not positive."""
     at = np.asarray(coordinates, float)
     names = tuple(points)
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
+    none = np.zeros(len(names), bool)
+    stations = none if station is None else np.asarray(station)
+    kinds = list(zip(names, stations.tolist(), strict=True))
+    if len(set(kinds)) < len(kinds):
+        twice = next(name for name, kind in kinds if kinds.count((name, kind)) > 1)
         raise ValueError(f"ground: point {twice!r} occurs twice")
     deviation = np.broadcast_to(np.asarray(sigma, float), at.shape)
     wrong = np.isfinite(at) & ~(deviation > 0)
@@ -78,8 +95,13 @@ def ground(
         raise ValueError(
             f"ground: point {name!r} has a standard deviation that is not positive"
         )
-    none = np.zeros(len(names), bool)
-    return Ground(names, at, deviation, none if check is None else np.asarray(check))
+    checks = none if check is None else np.asarray(check)
+    return Ground(names, at, deviation, checks, stations)
+
+
+def nothing_known() -> Ground:
+    """The ground of a free network."""
+    return ground((), np.zeros((0, 3)), 1.0)
 
 
 def from_pairs(

@@ -3,12 +3,13 @@ stations at once, by least squares.
 
     place - f (Xc, Yc) / Zc = 0,    Xc = R (X - S)
 
-Unknown are six numbers of each photo and three of each point, which are eliminated: with
-the orientation elements among the unknowns, the system of conditions of the 1982
-fragment on independent models is exactly this one. It is sparse
-(`adjustment.sparse`).
+Unknown are six numbers of each photo and three of each point, which are eliminated, and
+where they are asked for the `inner` parameters of the cameras. With the orientation
+elements among the unknowns, the system of conditions of the 1982 fragment on
+independent models is exactly this one. It is sparse (`adjustment.sparse`).
 """
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -17,17 +18,19 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment import Term
 from ..calibration.camera import Camera, Measured, Station, misfit, perspective
+from .inner import Inner, OfRay, cameras_of
 from .measured_block import Ground, MeasuredBlock
 
 
 class Start(NamedTuple):
     """Approximate values on the ground: quaternions of the rotations (w, x, y, z,
     object to camera as in `calibration.camera`), projection centres, and points, NaN
-    for those that are not known."""
+    for those that are not known; `inner`: parameters of each camera, None for zeros."""
 
     quaternions: Float[np.ndarray, "photo 4"]
     centres: Float[np.ndarray, "photo 3"]
     points: Float[np.ndarray, "point 3"]
+    inner: Float[np.ndarray, "camera parameter"] | None = None
 
 
 class Frame(NamedTuple):
@@ -58,9 +61,14 @@ def of_coordinate(point: Float[Array, "3"], known: tuple[Array, Array]):
     return point[known[0]] - known[1]
 
 
+def of_station(station: Station, known: tuple[Array, Array]):
+    """The misfit of one known coordinate of a projection centre."""
+    return of_coordinate(station.centre, known)
+
+
 def frame_of(start: Start) -> Frame:
     """The frame of a block: its middle, and the mean height above the points."""
-    _, centres, points = start
+    centres, points = start.centres, start.points
     middle = np.mean(centres, axis=0)
     there = np.all(np.isfinite(points), axis=1)
     apart = np.linalg.norm(points[there] - np.mean(points[there], axis=0), axis=1)
@@ -97,51 +105,96 @@ def number_points(
 
 
 class KnownCoordinates(NamedTuple):
-    """Known coordinates, one by one: of which row of `Ground`, of which point, which
-    axis."""
+    """Known coordinates, one by one: of which row of `Ground`, of which point (or photo,
+    where they are of a `station`), which axis."""
 
     row: Int[np.ndarray, " coordinate"]
-    point: Int[np.ndarray, " coordinate"]
+    number: Int[np.ndarray, " coordinate"]
     axis: Int[np.ndarray, " coordinate"]
     value: Float[np.ndarray, " coordinate"]
     sigma: Float[np.ndarray, " coordinate"]
+    station: Bool[np.ndarray, " coordinate"]
+
+    def take(self, some: np.ndarray) -> "KnownCoordinates":
+        """Some of them."""
+        return KnownCoordinates(*(column[some] for column in self))
+
+    def of_points(self, points: int) -> Int[np.ndarray, " point"]:
+        """How many are known of each point."""
+        return np.bincount(self.number[~self.station], minlength=points)
 
 
-def control_of(block: MeasuredBlock, ground: Ground) -> KnownCoordinates:
-    """The coordinates that take part: of points that are on a photo and no check
+def known_of(block: MeasuredBlock, ground: Ground) -> KnownCoordinates:
+    """The coordinates that take part: of points and photos of the block, and no check
     points."""
-    numbers = {name: k for k, name in enumerate(block.points)}
-    point = np.array([numbers.get(name, -1) for name in ground.points], int)
-    use = np.isfinite(ground.coordinates) & ((point >= 0) & ~ground.check)[:, None]
+    number = ground.numbers_in(block)
+    use = np.isfinite(ground.coordinates) & ((number >= 0) & ~ground.check)[:, None]
     row, axis = np.nonzero(use)
-    return KnownCoordinates(
-        row, point[row], axis, ground.coordinates[use], ground.sigma[use]
-    )
+    values = ground.coordinates[use], ground.sigma[use]
+    return KnownCoordinates(row, number[row], axis, *values, ground.station[row])
+
+
+def in_order(
+    known: KnownCoordinates, numbered: Numbered
+) -> tuple[KnownCoordinates, ...]:
+    """Those of points in the adjustment, and those of stations, as far as there are
+    any: in the order of their terms."""
+    there = numbered.number[np.where(known.station, 0, known.number)] >= 0
+    parts = known.take(~known.station & there), known.take(known.station)
+    return tuple(part for part in parts if len(part.row))
+
+
+def spread_known(
+    parts: tuple[KnownCoordinates, ...],
+    values: Sequence[np.ndarray],
+    rows: int,
+    otherwise: float | bool = np.nan,
+) -> np.ndarray:
+    """Values of the coordinates of all parts by the rows of `Ground`, (row, 3);
+    `otherwise` for the others."""
+    out = np.full((rows, 3), otherwise)
+    for part, of_part in zip(parts, values, strict=True):
+        out[part.row, part.axis] = of_part
+    return out
 
 
 def terms_of(
-    block: MeasuredBlock, numbered: Numbered, known: KnownCoordinates, units: Frame
+    block: MeasuredBlock,
+    numbered: Numbered,
+    parts: tuple[KnownCoordinates, ...],
+    units: Frame,
+    inner: Inner | None = None,
 ) -> tuple[Term, ...]:
-    """The conditions of rays and of known coordinates."""
+    """The conditions of rays, and those of each part of the known coordinates."""
     used = numbered.rays
     photo, point = block.photo[used], numbered.number[block.point[used]]
-    focal = block.focal[photo]
-    place = np.stack([block.x[used] / focal, -block.y[used] / focal], axis=1)
-    rays = Term(
-        of_ray,
-        place,
-        (block.sigma[used] / focal) ** 2,
-        touches=[("photo", photo), ("point", point)],
+    touches = [("photo", photo), ("point", point)]
+    if inner is not None:
+        touches.insert(1, ("camera", cameras_of(block.focal).of_photo[photo]))
+    place = places_of(block)[used]
+    variance = (block.sigma[used] / block.focal[photo]) ** 2
+    rays = Term(ray_condition(inner), place, variance, touches=touches)
+    return rays, *(_of_known(part, numbered, units) for part in parts)
+
+
+def ray_condition(inner: Inner | None) -> Callable:
+    """The condition of one ray."""
+    return of_ray if inner is None else OfRay(inner)
+
+
+def places_of(block: MeasuredBlock) -> Float[np.ndarray, "ray 2"]:
+    """The places in units of the focal length, y downwards."""
+    return np.stack([block.x, -block.y], axis=1) / block.focal[block.photo][:, None]
+
+
+def _of_known(part: KnownCoordinates, numbered: Numbered, units: Frame) -> Term:
+    """The conditions of known coordinates, of points or of stations."""
+    of_stations = bool(part.station[0])
+    member = part.number if of_stations else numbered.number[part.number]
+    values = (part.value - units.middle[part.axis]) / units.length
+    return Term(
+        of_station if of_stations else of_coordinate,
+        (part.axis, values),
+        (None, (part.sigma / units.length) ** 2),
+        touches=[("photo" if of_stations else "point", member)],
     )
-    there = numbered.number[known.point] >= 0
-    if not np.any(there):
-        return (rays,)
-    axis, sigma = known.axis[there], known.sigma[there]
-    middle = units.middle[axis]
-    coordinates = Term(
-        of_coordinate,
-        (axis, (known.value[there] - middle) / units.length),
-        (None, (sigma / units.length) ** 2),
-        touches=[("point", numbered.number[known.point[there]])],
-    )
-    return rays, coordinates

@@ -1,15 +1,25 @@
 """A block from its pairs alone to the adjusted block on the ground."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
 
+from ..adjustment import critical_values
 from ..batches.ragged import Ragged, clean_ragged
 from ..rejection import Recommended, Rejection
 from .adjust import BlockAdjustment
 from .chain import Chained, Oriented, chain, intersect, models_of
+from .components import (
+    GROUPS,
+    Component,
+    adjust_with_components,
+    components_of,
+    multiply,
+)
+from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, from_pairs
 from .network import Start
 from .place import Placed, on_ground, place
@@ -17,11 +27,13 @@ from .wrong import Wrong, adjust_without_wrong
 
 
 class OrientedBlock(NamedTuple):
-    """The adjusted block; what was left out as wrong; how its known points fitted
-    before the adjustment (None: a free network); and which pairs could be oriented."""
+    """The adjusted block; what was left out as wrong; the variance components, factors
+    of the stated standard deviations; how its known points fitted before the adjustment
+    (None: a free network); and which pairs could be oriented."""
 
     adjusted: BlockAdjustment
     wrong: Wrong
+    components: dict[str, Component]
     placed: Placed | None
     usable: Bool[np.ndarray, " pair"]
 
@@ -33,15 +45,20 @@ def orient_block(
     points: Sequence[str],
     ground: Ground | None = None,
     more: MeasuredBlock | None = None,
+    *,
+    inner: Inner | None = None,
     level: float = 0.05,
+    components: bool = False,
 ) -> OrientedBlock:
     """Orient the pairs without their wrong points, chain them, place them on the ground,
     and adjust everything, without what is wrong.
 
     `left`, `right`: the photos of each pair, in any order and direction; `points`: the
     names of all rows of `pairs`; `more`: the block with further rays, such as known
-    points on one photo; `level`: the probability that anything is called wrong if
-    nothing is. Without `ground` the network is free, its base lengths as the
+    points on one photo; `inner`: the inner parameters of the cameras that are unknown;
+    `level`: the probability that anything is called wrong if nothing is; `components`:
+    adjust with the standard deviations of places, known points and known stations as
+    the residuals tell them. Without `ground` the network is free, its base lengths as the
     chain has them. Raises `Unjoined` and `TooLittleControl` with what is missing.
     """
     block = from_pairs(left, right, pairs, points) if more is None else more
@@ -53,17 +70,64 @@ def orient_block(
         oriented,
     )
     chained = chain(block, models)
-    placed = None
+    usable = np.asarray(oriented.usable)
+    adjust = partial(_adjust, block, inner=inner, level=level, components=components)
+    if ground is None:
+        return OrientedBlock(*adjust(start_from(block, chained)), None, usable)
+    placed = place(block, chained, ground)
+    start = start_from(block, on_ground(chained, placed))
+    adjusted, wrong, found = adjust(start, leave_out(ground, placed.wrong))
+    fits = placed.wrong & _fits(adjusted, ground, level)
+    if np.any(fits):
+        # they stood out by the errors of the chain alone
+        placed = placed._replace(wrong=placed.wrong & ~fits)
+        left = leave_out(ground, placed.wrong)
+        adjusted, wrong, found = adjust(adjusted.as_start, left)
+    wrong = wrong._replace(control=wrong.control | placed.wrong[:, None])
+    return OrientedBlock(adjusted, wrong, found, placed, usable)
+
+
+def _adjust(
+    block: MeasuredBlock,
+    start: Start,
+    ground: Ground | None = None,
+    *,
+    inner: Inner | None,
+    level: float,
+    components: bool,
+) -> tuple[BlockAdjustment, Wrong, dict[str, Component]]:
+    """The adjustment without what is wrong, and its variance components; with them, if
+    they are asked for, what is wrong is looked for once more."""
+    adjusted, wrong = adjust_without_wrong(block, start, ground, inner, level)
+    if not components:
+        return adjusted, wrong, components_of(adjusted)
+    known = None
     if ground is not None:
-        placed = place(block, chained, ground)
-        chained = on_ground(chained, placed)
-        at = np.where(placed.wrong[:, None], np.nan, ground.coordinates)
-        ground = ground._replace(coordinates=at)
-    start = start_from(block, chained)
-    adjusted, wrong = adjust_without_wrong(block, start, ground, level)
-    if placed is not None:
-        wrong = wrong._replace(control=wrong.control | placed.wrong[:, None])
-    return OrientedBlock(adjusted, wrong, placed, np.asarray(oriented.usable))
+        at = np.where(wrong.control, np.nan, ground.coordinates)
+        known = ground._replace(coordinates=at)
+    start = adjusted.as_start
+    _, found = adjust_with_components(block, start, known, inner, wrong.rays)
+    factors = dict.fromkeys(GROUPS, 1.0) | {n: one.factor for n, one in found.items()}
+    scaled = multiply(block, ground, factors)
+    adjusted, wrong = adjust_without_wrong(scaled[0], start, scaled[1], inner, level)
+    return adjusted, wrong, found
+
+
+def leave_out(ground: Ground, rows: Bool[np.ndarray, " known"]) -> Ground:
+    """The ground without what is known of some rows, which keep their numbers."""
+    at = np.where(rows[:, None], np.nan, ground.coordinates)
+    return ground._replace(coordinates=at)
+
+
+def _fits(
+    adjusted: BlockAdjustment, ground: Ground, level: float
+) -> Bool[np.ndarray, " known"]:
+    """What is known and lies where the adjustment without it says."""
+    off, spread = adjusted.compare(ground)
+    z = np.abs(off) / np.hypot(spread, adjusted.sigma0 * ground.sigma)
+    each = critical_values.sidak(level, max(int(np.sum(np.isfinite(z))), 1))
+    known = np.any(np.isfinite(z), axis=1)
+    return known & np.all((z < critical_values.normal(each)) | np.isnan(z), axis=1)
 
 
 def _read(rejection: Rejection) -> tuple[tuple, tuple]:

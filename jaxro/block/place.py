@@ -1,10 +1,11 @@
 """A chained block on the ground, by three-point consensus, or where fewer than three
 points have all coordinates by all coordinates that are known (`absolute`).
 
-Three known points determine a similarity; the one with the smallest sum of the roots of
-all distances is taken, which one wrong point hardly changes. Known points that do not
-fit it at all have wrong coordinates, or the name of another point: after an adjustment,
-which bends the block to them, no test would name them.
+Known stations count as known points. Three known points determine a similarity; the one
+with the smallest sum of the roots of all distances is taken, which one wrong point
+hardly changes. Known points that do not fit it at all have wrong coordinates, or the
+name of another point: after an adjustment, which bends the block to them, no test would
+name them.
 """
 
 from itertools import combinations
@@ -57,10 +58,12 @@ def place(
 ) -> Placed:
     """The similarity that takes a chained block to its known points. Raises
     `TooLittleControl`."""
-    points = intersect(block, chained)
-    numbers = {name: k for k, name in enumerate(block.points)}
-    number = np.array([numbers.get(name, -1) for name in ground.points], int)
-    model = np.where((number >= 0)[:, None], points[np.maximum(number, 0)], np.nan)
+    number = ground.numbers_in(block)
+    there = np.maximum(number, 0)
+    points = intersect(block, chained)[np.where(ground.station, 0, there)]
+    stations = chained.centres[np.where(ground.station, there, 0)]
+    model = np.where(ground.station[:, None], stations, points)
+    model[number < 0] = np.nan
     at = np.where(ground.check[:, None], np.nan, ground.coordinates)
     whole = np.flatnonzero(np.all(np.isfinite(model) & np.isfinite(at), axis=1))
     if len(whole) < 3:

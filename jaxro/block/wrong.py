@@ -15,9 +15,10 @@ from jaxtyping import Bool, Float
 
 from ..adjustment import critical_values
 from ..adjustment.sparse import Minimum, Problem, minimise, residuals_of
-from .adjust import BlockAdjustment, Prepared, conclude, prepare_block
+from .adjust import BlockAdjustment, Prepared, adjust_block, prepare_block
+from .inner import Inner
 from .measured_block import Ground, MeasuredBlock
-from .network import Start
+from .network import Start, spread_known
 from .place import TooLittleControl
 
 SURE = 3.0
@@ -67,33 +68,39 @@ def adjust_without_wrong(
     block: MeasuredBlock,
     start: Start,
     ground: Ground | None = None,
+    inner: Inner | None = None,
     level: float = 0.05,
 ) -> tuple[BlockAdjustment, Wrong]:
-    """Adjust a block without its wrong rays and known coordinates. Raises
-    `TooLittleControl` where hardly a known coordinate fits the photos."""
-    prepared = prepare_block(block, start, ground)
+    """Adjust a block without its wrong rays and known coordinates. `inner`: the inner
+    parameters that are unknown. Raises `TooLittleControl` where hardly a known
+    coordinate fits the photos."""
+    prepared = prepare_block(block, start, ground, inner)
     found = settle(prepared)
     wrong = _far(prepared, found)
-    adjusted = adjust_rest(block, prepared.start_at(found), ground, wrong)
+    begin = prepared.start_at(found)
+    adjusted = adjust_rest(block, begin, ground, wrong, inner)
     for _ in range(TESTS):
         more = _worst(adjusted, normalise_residuals(adjusted, level))
         if not (np.any(more.rays) or np.any(more.control)):
             return adjusted, wrong._replace(settled=True)
         wrong = wrong | more
-        adjusted = adjust_rest(block, adjusted.as_start, ground, wrong)
+        adjusted = adjust_rest(block, adjusted.as_start, ground, wrong, inner)
     return adjusted, wrong
 
 
 def adjust_rest(
-    block: MeasuredBlock, start: Start, ground: Ground | None, wrong: Wrong
+    block: MeasuredBlock,
+    start: Start,
+    ground: Ground | None,
+    wrong: Wrong,
+    inner: Inner | None = None,
 ) -> BlockAdjustment:
     """The adjustment without what is wrong; rays and points keep their numbers."""
     if ground is not None:
         at = np.where(wrong.control, np.nan, ground.coordinates)
         _check_control(ground, at)
         ground = ground._replace(coordinates=at)
-    prepared = prepare_block(block, start, ground, left_out=wrong.rays)
-    return conclude(prepared, minimise(prepared.problem, datum=prepared.datum))
+    return adjust_block(block, start, ground, inner, wrong.rays)
 
 
 def _check_control(ground: Ground, left: Float[np.ndarray, "known 3"]) -> None:
@@ -167,15 +174,11 @@ def _scale(sizes: Float[np.ndarray, " group"], before: float) -> float:
 
 def _far(prepared: Prepared, found: Minimum) -> Wrong:
     """What is beyond `CLEAR`."""
-    block, known, numbered = prepared.block, prepared.known, prepared.numbered
-    far = [sizes > CLEAR for sizes in _sizes(found.problem)]
-    rays = np.zeros(len(block.photo), bool)
-    rays[numbered.rays] = far[0]
-    control = np.zeros((_control_points(prepared.ground), 3), bool)
-    if len(far) > 1:
-        there = numbered.number[known.point] >= 0
-        control[known.row[there], known.axis[there]] = far[1]
-    return Wrong(rays, control)
+    far, *of_known = [sizes > CLEAR for sizes in _sizes(found.problem)]
+    rays = np.zeros(len(prepared.block.photo), bool)
+    rays[prepared.numbered.rays] = far
+    number = _control_points(prepared.ground)
+    return Wrong(rays, spread_known(prepared.known, of_known, number, False))
 
 
 def _worst(adjusted: BlockAdjustment, tested: Tested) -> Wrong:
@@ -192,12 +195,12 @@ def _worst(adjusted: BlockAdjustment, tested: Tested) -> Wrong:
     if adjusted.ground is not None and len(tested.control) > 0:
         of_known = np.max(np.nan_to_num(np.abs(tested.control)), axis=1)
         worst = int(np.argmax(of_known))
-        name = adjusted.ground.points[worst]
-        number = block.points.index(name) if name in block.points else -1
-        beside = of_point[number] if number >= 0 else 0.0
+        number = adjusted.ground.numbers_in(block)[worst]
+        station = adjusted.ground.station[worst]
+        beside = 0.0 if station or number < 0 else of_point[number]
         if of_known[worst] > max(tested.limit, beside):
             control[worst] = True
-            free_points[number] = False
+            (free_photos if station else free_points)[number] = False
     for ray in np.argsort(-of_ray):
         if of_ray[ray] <= tested.limit:
             break

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..batches.ragged import Ragged
 from ..block.chain import Unjoined
+from ..block.inner import Inner
 from ..block.measured_block import (
     Ground,
     MeasuredBlock,
@@ -31,6 +32,10 @@ from ..tables.measured import Table, to_list, to_ragged
 from ..tables.survey_checks import Row
 from . import request, sigma as deviation
 
+RADIAL = ("k1", "k2", "k3")
+INNER = ("focal", "principal", *RADIAL, "tangential", "affinity")
+"""Inner parameters by the names of --inner; those of Brown stand for all below them."""
+
 EXACT = 1e-3
 """The standard deviation of a coordinate without error, as a part of the smallest other
 one: weights are inverses of variances."""
@@ -44,6 +49,8 @@ class Options:
     control: Path | None = None
     control_sigma: float | None = None
     rays: Path | None = None
+    inner: str | None = None
+    components: bool = False
     level: float = 0.05
     unit: str = "m"
     parquet: bool = False
@@ -142,7 +149,11 @@ def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
     pairs, told = _measured(options, table, cameras)
     ground, approximate = None, 0
     if options.control is not None:
-        points = ground_tables.read(options.control, options.measured.semicolons)
+        points = ground_tables.read(
+            options.control,
+            options.measured.semicolons,
+            (*ground_tables.ROLES, ground_tables.STATION),
+        )
         ground, approximate = _ground(points, options.control_sigma)
     task = Task(
         title=table.file,
@@ -166,6 +177,7 @@ def _check(options: Options) -> None:
         raise TableError(
             "--control-sigma", found=repr(value), expected="a positive number"
         )
+    inner_of(options.inner)
     if not 0 < options.level < 1:
         raise TableError(
             "--level", found=repr(options.level), expected="a probability such as 0.05"
@@ -197,6 +209,27 @@ def _check(options: Options) -> None:
             found="it beside a table",
             expected="it without a table, for a simulated block",
         )
+
+
+def inner_of(given: str | None) -> Inner | None:
+    """The inner parameters that are unknown, by their names. Raises TableError."""
+    if given is None:
+        return None
+    names = {name.strip() for name in given.split(",")}
+    if strange := names - set(INNER):
+        raise TableError(
+            "--inner",
+            found=repr(sorted(strange)[0]),
+            expected=f"some of {','.join(INNER)}",
+        )
+    radial = max((RADIAL.index(name) + 1 for name in names & set(RADIAL)), default=0)
+    return Inner(
+        focal="focal" in names,
+        principal="principal" in names,
+        radial=radial,
+        tangential="tangential" in names,
+        affinity="affinity" in names,
+    )
 
 
 def _read(options: Options) -> Table:
@@ -290,7 +323,10 @@ def _ground(points: GroundPoints, sigma: float | None) -> tuple[Ground, int]:
     least = float(np.min(positive)) if positive.size else 1.0
     spread = np.where(spread == 0, EXACT * least, spread)
     names = [points.names[k] for k in use]
-    known = known_points(names, at, spread, points.is_a("check")[use])
+    checks, stations = (
+        points.is_a(role)[use] for role in ("check", ground_tables.STATION)
+    )
+    known = known_points(names, at, spread, checks, stations)
     return known, len(points.names) - len(use)
 
 
@@ -410,7 +446,9 @@ def calculate(task: Task, options: Options) -> Done:
                 task.points,
                 task.ground,
                 more=task.more,
+                inner=inner_of(options.inner),
                 level=options.level,
+                components=options.components,
             )
     except Unjoined as error:
         raise TableError(

@@ -13,8 +13,8 @@ Control = Annotated[
     Path | None,
     typer.Option(
         help="CSV table of points on the ground: point,X,Y,Z, blank where a coordinate "
-        "is not known, sX,sY,sZ or sigma, and optionally role: control, check. Without "
-        "it the block is a free network.",
+        "is not known, sX,sY,sZ or sigma, and optionally role: control, check, station "
+        "(of the photo of this name). Without it the block is a free network.",
         metavar="GROUND.csv",
         show_default=False,
     ),
@@ -43,6 +43,24 @@ Sigma = Annotated[
         "  [default: auto, that of the residuals of the pairs]",
         metavar="SD|auto",
         show_default=False,
+    ),
+]
+InnerNames = Annotated[
+    str | None,
+    typer.Option(
+        "--inner",
+        help="Inner parameters of the cameras that are unknown, too: some of "
+        "focal,principal,k1,k2,k3,tangential,affinity.",
+        metavar="NAME,...",
+        show_default=False,
+    ),
+]
+Components = Annotated[
+    bool,
+    typer.Option(
+        "--components",
+        help="Adjust with the standard deviations of places, control and stations as "
+        "their residuals tell them (variance components).",
     ),
 ]
 Level = Annotated[
@@ -122,6 +140,8 @@ def block(
     y_down: given.YDown = False,
     semicolons: given.Semicolons = False,
     sigma: Sigma = None,
+    inner: InnerNames = None,
+    components: Components = False,
     level: Level = 0.05,
     unit: Unit = "m",
     photo_unit: PhotoUnit = "mm",
@@ -159,6 +179,8 @@ def block(
         control=control,
         control_sigma=control_sigma,
         rays=rays,
+        inner=inner,
+        components=components,
         level=level,
         unit=unit,
         parquet=parquet or (file is not None and is_parquet(file)),

@@ -28,6 +28,7 @@ def show(console: Console, done: Done) -> None:
         console.print(_consistency(done), markup=False)
         _left_out(console, done)
         console.print(_accuracy(done), markup=False)
+        _cameras(console, done)
         _photos(console, done)
         _control(console, done)
         _checks(console, done)
@@ -90,7 +91,22 @@ def _consistency(done: Done) -> str:
     return (
         f"Internal consistency: sigma0 {number(sigma0, digits(sigma0, 2))}, {freedom} "
         f"degrees of freedom, probability beside 1: {done.chance:.2g} ({done.sigma})"
+        f"{_components(done)}"
     )
+
+
+def _components(done: Done) -> str:
+    """By which factors each group differs from the stated standard deviations."""
+    found = done.oriented.components
+    if len(found) < 2:
+        return ""
+    told = [
+        f"{name} {one.factor:.2f} ± {one.deviation:.2f}"
+        if np.isfinite(one.deviation)
+        else f"{name} not told"
+        for name, one in found.items()
+    ]
+    return f"\nVariance components, times the stated: {', '.join(told)}"
 
 
 def _left_out(console: Console, done: Done) -> None:
@@ -144,6 +160,21 @@ def _accuracy(done: Done) -> str:
 
 # -------------------------------------------------------------------------------------
 # tables
+
+
+def _cameras(console: Console, done: Done) -> None:
+    """The inner parameters that were unknown."""
+    if done.adjusted.inner is None:
+        return
+    found = done.adjusted.cameras
+    rows = table("camera", "parameter", "value", "± sd", title="Inner parameters")
+    rows.columns[1].justify = "left"
+    values = zip(found.values, found.deviations, strict=True)
+    for k, (own, deviations) in enumerate(values):
+        for name, value, spread in zip(found.names, own, deviations, strict=True):
+            cells = f"{value:.6g}", f"{spread:.2g}"
+            rows.add_row(str(k + 1), name, *cells)
+    console.print(rows)
 
 
 def _photos(console: Console, done: Done) -> None:

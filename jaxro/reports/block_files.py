@@ -9,7 +9,7 @@ import numpy as np
 from .. import __version__
 from ..adjustment import RESULTS
 from . import files
-from .block_model import Done
+from .block_model import STATION_OF, Done
 from .control import AXES, Compared
 
 ANGLES = ("omega", "phi", "kappa")
@@ -26,6 +26,7 @@ def tables(done: Done) -> dict[str, Columns]:
         "points": _points(done),
         "control": _control(done),
         "residuals": _residuals(done),
+        "cameras": _cameras(done),
         "photo_covariances": _photo_covariances(done),
         "point_covariances": _point_covariances(done),
     }
@@ -55,6 +56,9 @@ def summary(done: Done) -> dict[str, Any]:
         "sigma0": adjusted.sigma0,
         "degrees_of_freedom": adjusted.degrees_of_freedom,
         "probability": done.chance if adjusted.degrees_of_freedom > 0 else None,
+        "components": {
+            name: one._asdict() for name, one in done.oriented.components.items()
+        },
         "iterations": adjusted.adjustment.iterations,
         "pairs": len(done.pairs),
         "pairs_without_orientation": _unoriented(done),
@@ -100,6 +104,20 @@ def _photos(done: Done) -> Columns:
     return table | {"rays": done.points_of_photos}
 
 
+def _cameras(done: Done) -> Columns:
+    """The inner parameters that were unknown, one in each row."""
+    if done.adjusted.inner is None:
+        return {"camera": []}
+    found = done.adjusted.cameras
+    number = len(found.names)
+    return {
+        "camera": np.repeat(np.arange(len(found.values)) + 1, number),
+        "parameter": list(found.names) * len(found.values),
+        "value": found.values.ravel(),
+        "sd": found.deviations.ravel(),
+    }
+
+
 def _points(done: Done) -> Columns:
     there = np.flatnonzero(done.determined)
     adjusted = done.adjusted
@@ -122,13 +140,18 @@ def _control(done: Done) -> Columns:
     left_out = np.concatenate([done.wrong_control, np.zeros(blank.shape, bool)])
     table: Columns = {
         "point": [name for one in both for name in one.names],
-        "role": ["control"] * len(both[0].names) + ["check"] * len(both[1].names),
+        "role": [_role(n, "control") for n in both[0].names]
+        + [_role(n, "check") for n in both[1].names],
     }
     table |= _with_names(AXES, shown(stack(lambda one: one.given)))
     table |= _with_names(AXES, shown(stack(lambda one: one.differences)), "v")
     table |= _with_names(AXES, shown(redundancy), "redundancy_")
     table |= _with_names(AXES, shown(stack(_tests)), "w_")
     return table | {"left_out": np.any(left_out & known, axis=1).tolist()}
+
+
+def _role(name: str, role: str) -> str:
+    return "station" if name.startswith(STATION_OF) else role
 
 
 def _tests(one: Compared) -> np.ndarray:

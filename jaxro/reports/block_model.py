@@ -15,8 +15,12 @@ from ..block.orient_block import OrientedBlock
 from ..block.wrong import Tested, normalise_residuals
 from .control import LEVEL, Compared
 
-FEW = 1e-12
+LEAST = 1e-12
 """What stands for a standard deviation of zero where it divides."""
+
+
+STATION_OF = "station of"
+"""What the name of a photo has before it among known points."""
 
 
 class LeftOut(NamedTuple):
@@ -109,19 +113,13 @@ class Done:
     # ---------------------------------------------------------------------------------
     # the ground
 
-    @cached_property
-    def _points(self) -> Int[np.ndarray, " known"]:
-        """The numbers of the known points in the block, -1 where it has not got them."""
-        if self.ground is None:
-            return np.zeros(0, int)
-        numbers = {name: k for k, name in enumerate(self.adjusted.block.points)}
-        return np.array([numbers.get(name, -1) for name in self.ground.points], int)
-
     @property
     def strange(self) -> list[str]:
-        """Known points that are on no photo."""
-        names = () if self.ground is None else self.ground.points
-        return [n for n, k in zip(names, self._points, strict=True) if k < 0]
+        """Known points that are on no photo, and stations of no photo."""
+        if self.ground is None:
+            return []
+        there = self.ground.numbers_in(self.adjusted.block) >= 0
+        return [self.ground.points[k] for k in np.flatnonzero(~there)]
 
     @cached_property
     def control(self) -> Compared:
@@ -131,7 +129,7 @@ class Done:
         rows = self._rows(~self.ground.check)
         w = self.tested.control[rows]
         # of what was left out as of a check point
-        w = np.where(np.isfinite(w), w, self._off(rows) / self._spread(rows))
+        w = np.where(np.isfinite(w), w, self._ratios[rows])
         # nothing checks a coordinate that takes part and has no w
         used = np.isfinite(self.adjusted.control_residuals[rows])
         untested = used & ~np.isfinite(self.tested.control[rows])
@@ -158,7 +156,7 @@ class Done:
         if self.ground is None:
             return self._compare(np.zeros(0, int), np.zeros((0, 3)))
         rows = self._rows(self.ground.check)
-        return self._compare(rows, self._off(rows) / self._spread(rows))
+        return self._compare(rows, self._ratios[rows])
 
     @property
     def limit_of_checks(self) -> float:
@@ -167,24 +165,28 @@ class Done:
         number = max(int(np.sum(self.checks.known)), 1)
         return float(critical.normal(critical.sidak(LEVEL, number)))
 
+    @cached_property
+    def _apart(self) -> tuple[np.ndarray, np.ndarray]:
+        """Adjusted minus given coordinates, and the deviations of the adjusted ones."""
+        assert self.ground is not None
+        return self.adjusted.compare(self.ground)
+
+    @property
+    def _ratios(self) -> Float[np.ndarray, "known 3"]:
+        """The differences of what takes no part in their standard deviations."""
+        off, spread = self._apart
+        assert self.adjusted.ground is not None
+        given = self.adjusted.sigma0 * np.nan_to_num(self.adjusted.ground.sigma)
+        return off / np.maximum(np.hypot(spread, given), LEAST)
+
     def _rows(self, wanted: Bool[np.ndarray, " known"]) -> Int[np.ndarray, " some"]:
-        """The wanted rows of the ground that have a point in the adjustment."""
-        there = self._points >= 0
-        there &= self.determined[np.maximum(self._points, 0)]
-        return np.flatnonzero(wanted & there)
+        """The wanted rows of the ground that the adjustment has coordinates of."""
+        return np.flatnonzero(wanted & np.any(np.isfinite(self._apart[1]), axis=1))
 
-    def _off(self, rows: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some 3"]:
-        """Adjusted minus given coordinates."""
+    def _name(self, row: int) -> str:
         assert self.ground is not None
-        adjusted = self.adjusted.coordinates[self._points[rows]]
-        return adjusted - self.ground.coordinates[rows]
-
-    def _spread(self, rows: Int[np.ndarray, " some"]) -> Float[np.ndarray, "some 3"]:
-        """The standard deviations of these differences, of points that take no part."""
-        assert self.ground is not None
-        own = self.adjusted.deviations[self._points[rows]]
-        given = np.nan_to_num(self.ground.sigma[rows])
-        return np.maximum(np.hypot(own, self.adjusted.sigma0 * given), FEW)
+        name = self.ground.points[row]
+        return f"{STATION_OF} {name}" if self.ground.station[row] else name
 
     def _compare(
         self, rows: Int[np.ndarray, " some"], w: Float[np.ndarray, "some 3"]
@@ -195,9 +197,9 @@ class Done:
         given = self.ground.coordinates[rows]
         known = np.isfinite(given)
         return Compared(
-            names=[self.ground.points[k] for k in rows],
+            names=[self._name(int(k)) for k in rows],
             given=given,
             known=known,
-            differences=np.where(known, self._off(rows), 0.0),
+            differences=np.where(known, self._apart[0][rows], 0.0),
             w=np.where(known, w, 0.0),
         )

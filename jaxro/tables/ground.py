@@ -6,6 +6,7 @@ for all three (0: without error), and role:
 control       it takes part in an adjustment (also where the field is blank)
 check         the result is only compared with it
 approximate   it may help to begin, no more
+station       it is the projection centre of the photo of this name, of a block
 """
 
 import io
@@ -22,6 +23,7 @@ from .survey_checks import Row
 AXES = ("x", "y", "z")
 DEVIATIONS = ("sx", "sy", "sz")
 ROLES = ("control", "check", "approximate")
+STATION = "station"
 SHORT = {"s_x": "sx", "s_y": "sy", "s_z": "sz"}
 TEXTS = ("point", "role")
 
@@ -65,15 +67,23 @@ class GroundPoints:
         )
 
 
-def read(path: Path, semicolons: bool = False) -> GroundPoints:
-    """The points of a file; `semicolons` as in `fields.lines_of`. Raises TableError."""
-    return parse(fields.read_text(path), str(path), semicolons)
+def read(
+    path: Path, semicolons: bool = False, roles: tuple[str, ...] = ROLES
+) -> GroundPoints:
+    """The points of a file, and stations if their role is one of `roles`; `semicolons`
+    as in `fields.lines_of`. Raises TableError."""
+    return parse(fields.read_text(path), str(path), semicolons, roles)
 
 
-def parse(text: str, file: str, semicolons: bool = False) -> GroundPoints:
+def parse(
+    text: str,
+    file: str,
+    semicolons: bool = False,
+    roles: tuple[str, ...] = ROLES,
+) -> GroundPoints:
     """The points of CSV text. Raises TableError."""
     rows: list[Row] = []
-    first: dict[str, int] = {}
+    first: dict[tuple[str, bool], int] = {}
     line = 1
     given = io.StringIO(text, newline="")
     for line, cells in fields.lines_of(given, file, GROUND, semicolons):
@@ -81,13 +91,15 @@ def parse(text: str, file: str, semicolons: bool = False) -> GroundPoints:
         if not rows:
             _check_columns(row)
         name = fields.name(cells["point"], file, line, "point")
-        if name in first:
+        # a photo may have the name of a point
+        key = name, _role(row, roles) == STATION
+        if key in first:
             raise row.error(
                 "point",
-                found=f"{name!r} a second time (first on line {first[name]})",
+                found=f"{name!r} a second time (first on line {first[key]})",
                 expected="each point once, with all that is known of it on one line",
             )
-        first[name] = line
+        first[key] = line
         rows.append(row)
     if not rows:
         raise TableError(
@@ -104,10 +116,10 @@ def parse(text: str, file: str, semicolons: bool = False) -> GroundPoints:
         deviations = np.array([_deviations(row, known) for row, known in both])
     return GroundPoints(
         file=file,
-        names=list(first),
+        names=[name for name, _ in first],
         coordinates=coordinates,
         deviations=deviations,
-        roles=[_role(row) for row in rows],
+        roles=[_role(row, roles) for row in rows],
         lines=np.array([row.line for row in rows]),
     )
 
@@ -164,15 +176,15 @@ def _deviations(row: Row, coordinates: np.ndarray) -> list[float]:
     return found
 
 
-def _role(row: Row) -> str:
+def _role(row: Row, roles: tuple[str, ...]) -> str:
     given = row.cells.get("role", "").lower()
-    if given and given not in ROLES:
+    if given and given not in roles:
         raise row.error(
             "role",
             found=repr(row.cells["role"]),
-            expected=f"{', '.join(ROLES[:-1])} or {ROLES[-1]}; blank: {ROLES[0]}",
+            expected=f"{', '.join(roles[:-1])} or {roles[-1]}; blank: {roles[0]}",
         )
-    return given or ROLES[0]
+    return given or roles[0]
 
 
 def _number(row: Row, column: str, advice: str = "") -> float:

@@ -85,6 +85,9 @@ def test_points_and_photos_are_true_within_their_deviations(made, tables, tmp_pa
     )
     control = rows(out / "control.csv")
     assert {row["role"] for row in control} == {"control", "check"}
+    v, w = (numbers(control, *(b + a for a in AXES)) for b in ("v", "w_"))
+    tested = np.isfinite(w)
+    assert np.all(np.sign(v[tested]) == np.sign(w[tested]))
     checks = [row for row in control if row["role"] == "check"]
     assert np.all(np.abs(numbers(checks, "w_X", "w_Y", "w_Z")) < 4)
 
@@ -146,6 +149,34 @@ def test_a_control_point_on_one_photo_counts(tables, tmp_path):
     found = json_of(tables, tmp_path / "more", "--rays", rays)
     assert found["degrees_of_freedom"] == plain["degrees_of_freedom"] + 2
     assert found["points"] == plain["points"] + 1
+
+
+def test_stations_inner_parameters_and_components(tables, tmp_path):
+    """Stations are rows of the ground with this role; a wrong focal length is found."""
+    plain = json_of(tables, tmp_path / "plain")
+    photos = rows(tmp_path / "plain/photos.csv")
+    rng = np.random.default_rng(1)
+    for row in photos:
+        at = [float(row[a]) + rng.normal(0, 0.1) for a in AXES]
+        line = ",".join([row["photo"], *map(str, at), "0.1,0.1,0.1,station"])
+        tables[1].write_text(tables[1].read_text() + line + "\n")
+    out = tmp_path / "out"
+    told = run(
+        *("block", tables[0], "--control", tables[1], "--focal", "153.4"),
+        *("--sigma", "0.005", "--inner", "focal,principal", "--components"),
+        *("--out", out),
+    )
+    assert told.exit_code == 0, told.output
+    assert "Variance components, times the stated: places" in told.stdout
+    assert "station of 1-1" in told.stdout
+    cameras = rows(out / "cameras.csv")
+    assert [row["parameter"] for row in cameras] == ["focal", "x0", "y0"]
+    for row, true in zip(cameras, (153.0, 0.0, 0.0), strict=True):
+        assert abs(float(row["value"]) - true) < 4 * float(row["sd"])
+    summary = json.loads((out / "summary.json").read_text())
+    freedom = plain["degrees_of_freedom"] + 3 * len(photos) - 3
+    assert summary["degrees_of_freedom"] == freedom
+    assert set(summary["components"]) == {"places", "control", "stations"}
 
 
 def json_of(tables, out, *more):
@@ -280,6 +311,7 @@ def divided(pairs):
         (("--control", "ground.csv"), "--control: found it without PAIRS.csv"),
         (("--control-sigma", "0.1"), "--control-sigma: found it without --control"),
         (("--level", "2"), "--level: found 2.0"),
+        (("--inner", "focal,zoom"), "--inner: found 'zoom'; expected some of focal"),
     ],
 )
 def test_options_without_their_table(arguments, said):
