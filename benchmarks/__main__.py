@@ -24,6 +24,7 @@ def machine() -> str:
 
 def main() -> int:
     from . import (
+        block,
         calibration,
         colmap,
         engine,
@@ -44,6 +45,7 @@ def main() -> int:
         | colmap.SUITES
         | photos.SUITES
         | calibration.SUITES
+        | block.SUITES
     )
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)

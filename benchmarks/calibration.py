@@ -4,8 +4,6 @@ Every workload runs in a new process, without any compiled program at hand. Time
 processor times: those of all threads together, as on one core.
 """
 
-import json
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -24,6 +22,9 @@ from jaxro.calibration import Brown, Field, Model, Whole
 from .common import Size, ratio
 from .first import BARE, seconds_of
 from .metrics import Metric
+from .processes import in_new_process
+
+HERE = "calibration"
 
 SIGMA, FOCAL, CENTRE = 0.1, 1800.0, np.array([512.0, 384.0])
 """Of the images of networks, in pixels; the principal place is their middle."""
@@ -37,14 +38,6 @@ def timed(call: Callable[[], Any]) -> tuple[float, Any]:
     begin = time.process_time()
     answer = jax.block_until_ready(call())
     return time.process_time() - begin, answer
-
-
-def in_new_process(call: str) -> list[Metric]:
-    """What a function of this module measures in a new process."""
-    module = "import json, dataclasses as d; from benchmarks import calibration as c"
-    code = f"{module}; print(json.dumps([d.astuple(metric) for metric in c.{call}]))"
-    output = subprocess.check_output([sys.executable, "-c", code], text=True)
-    return [Metric(*row) for row in json.loads(output)]
 
 
 def demand(apart: Any, bound: float, what: str) -> None:
@@ -223,13 +216,13 @@ def first_answers(size: Size, *names: str) -> list[Metric]:
     """`answers` of some of `CALLS`."""
     bare = [seconds_of([sys.executable, "-c", BARE]) for _ in range(size.processes + 2)]
     calls = [f"answers({n!r}, {median(bare)}, {size.repeats})" for n in names]
-    return [metric for call in calls for metric in in_new_process(call)]
+    return [metric for call in calls for metric in in_new_process(HERE, call)]
 
 
 def one_image(size: Size) -> list[Metric]:
     """100 points; and 60 models of 21 images."""
     found = first_answers(size, "calibrate", "choose")
-    return [*found, *in_new_process(f"models({21 if size.robust > 1 else 3})")]
+    return [*found, *in_new_process(HERE, f"models({21 if size.robust > 1 else 3})")]
 
 
 def several_images(size: Size) -> list[Metric]:
@@ -240,7 +233,7 @@ def several_images(size: Size) -> list[Metric]:
 def many_images(size: Size) -> list[Metric]:
     """60 images of 26,000 points."""
     amount = "60, 26_000, 3" if size.robust > 1 else "8, 400, 1"
-    return in_new_process(f"large_network({amount})")
+    return in_new_process(HERE, f"large_network({amount})")
 
 
 SUITES: dict[str, Callable[[Size], list[Metric]]] = {
