@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
@@ -23,7 +24,7 @@ from ..xla.programs import Program, is_traced
 from ..xla.settings import COMPILE_FAST
 from . import symmetric
 
-Scalar = Float[Array, ""]
+Scalar = Float[Array | np.ndarray | np.generic, ""]
 
 INVISIBLE = 1e-10
 """Part of the sum of squares that a step may promise and rounding may hide: such a step
@@ -70,15 +71,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     norm: Callable = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        squares = _squares(fn(y, args)[0])
-        one = jnp.ones_like(squares)
-        return State(
-            squares=squares,
-            damping=self.damping * one,
-            growth=2 * one,
-            decrement=jnp.inf * one,
-            done=jnp.zeros((), bool),
-        )
+        squares = _at_once(_squares, fn(y, args)[0])
+        return _at_once(_begin, squares, damping=self.damping)
 
     def step(self, fn, y, args, options, state, tags):
         known = hasattr(args, "damped")
@@ -89,18 +83,36 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
         back = jax.tree.map(operator.neg, found.step)
         moved = args.further(y, back) if known else jax.tree.map(jnp.add, y, back)
-        data = state, found, y, moved, _squares(fn(moved, args)[0])
+        squares = _at_once(_squares, fn(moved, args)[0])
+        data = state, found, y, moved, squares
         lengths = {"rtol": self.rtol, "atol": self.atol}
-        if is_traced(data):
-            return *_decide(data, **lengths), None
-        # one program, where the host works between the steps
-        return *Program(_decide, lengths, COMPILE_FAST)(data), None
+        return *_at_once(_decide, data, **lengths), None
 
     def terminate(self, fn, y, args, options, state, tags):
         return state.done, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         return y, aux, {}
+
+
+def _at_once(function: Callable, data: PyTree, **options: float) -> Any:
+    """The function as one program, where the host works between the steps; else as part
+    of the caller's."""
+    if is_traced(data):
+        return function(data, **options)
+    return Program(function, options, COMPILE_FAST)(data)
+
+
+def _begin(squares: Scalar, damping: float) -> State:
+    """The state before the first step."""
+    one = jnp.ones_like(squares)
+    return State(
+        squares=squares,
+        damping=damping * one,
+        growth=2 * one,
+        decrement=jnp.inf * one,
+        done=jnp.zeros((), bool),
+    )
 
 
 def _decide(

@@ -61,6 +61,9 @@ that any damping to speak of would hide."""
 LEAST_WEIGHT = 1e-10
 """A weight is at least this, so that nothing is divided by zero."""
 
+FEWEST = 64
+"""Groups for which there is room in each term: fewer ones share their programs."""
+
 SHORT = 1e-6
 """A step of so many standard deviations is the last one: what the next one would be is
 the square of it."""
@@ -191,13 +194,13 @@ def prepare(
     return Problem(data, roles, slots, levels, groups, members)
 
 
-def with_room(tree: Any) -> Any:
-    """All leaves with more rows, which repeat the first one."""
+def with_room(tree: Any, least: int = 1) -> Any:
+    """All leaves with more rows, at least so many, which repeat the first one."""
 
     def longer(a: ArrayLike) -> np.ndarray:
         # in NumPy: JAX would compile this for every number of rows
         rows = np.asarray(a)
-        missing = room_for(len(rows)) - len(rows)
+        missing = max(room_for(len(rows)), least) - len(rows)
         return np.concatenate([rows, np.repeat(rows[:1], missing, axis=0)])
 
     return jax.tree.map(longer, tree)
@@ -205,12 +208,10 @@ def with_room(tree: Any) -> Any:
 
 def _term_with_room(term: Term) -> Term:
     """The term with more groups, which are not in use."""
-    longer = with_room(
-        (term.observations, term.cofactor, [member for _, member in term.touches])
-    )
-    observations, cofactor, touched = longer
+    columns = term.observations, term.cofactor, [m for _, m in term.touches]
+    observations, cofactor, touched = with_room(columns, FEWEST)
     names = [name for name, _ in term.touches]
-    use = np.zeros(room_for(len(term.mask)), bool)
+    use = np.zeros(max(room_for(len(term.mask)), FEWEST), bool)
     use[: len(term.mask)] = np.asarray(term.mask)
     return Term(
         term.condition,
@@ -237,7 +238,7 @@ def _weighted(term: Term, weight: Float[np.ndarray, " group"]) -> Term:
 
 def residuals_of(problem: Problem) -> list[Float[np.ndarray, "_ _"]]:
     """The whitened residuals of each term where the families stand."""
-    rows = _System(problem, None)(origin(problem.data, problem.roles))
+    rows = _System(problem, None)(origin(problem.data, problem.roles, np))
     return [np.asarray(a)[:n] for a, n in zip(rows, problem.groups, strict=True)]
 
 
@@ -258,9 +259,11 @@ class _System:
         data, roles = self.problem.data, self.problem.roles
         factored, reduced, carried = self.factorise(steps, damping)
         x, c = factored.step(np.asarray(reduced.h), np.asarray(reduced.b))
-        x, c = jnp.asarray(x), jnp.asarray(c)
+        x, c = jax.device_put((x, c))
         back = Program(carry_back, {"data": data}, COMPILE_FAST)
-        y, decrement, spread = back((x, c, carried))
+        y, decrement, spread = map(np.asarray, back((x, c, carried)))
+        # in NumPy, which compiles nothing for what follows
+        x, c, damping = (np.asarray(a) for a in (x, c, damping))
         step = {roles.linked: x, roles.eliminated: y}
         for k, name in enumerate(roles.common):
             own = steps[name].shape
@@ -271,7 +274,9 @@ class _System:
 
     def further(self, steps: Steps, step: Steps) -> Steps:
         """The displacements followed by a step."""
-        return jax.tree.map(jnp.add, steps, step)
+        # by NumPy, which compiles nothing
+        add = lambda a, b: np.asarray(a) + np.asarray(b)
+        return jax.tree.map(add, steps, step)
 
     def datum_at(self, steps: Steps) -> Datum:
         """The datum of the displaced families, with rows for the room of the linked
@@ -309,7 +314,11 @@ def minimise(
     system = _System(problem, datum)
     solver = LevenbergMarquardt(rtol=SHORT, damping=FIRST_DAMPING)
     function = lambda steps, system: (system(steps), None)
-    steps, done, result = origin(problem.data, problem.roles), False, RESULTS.diverged
+    steps, done, result = (
+        origin(problem.data, problem.roles, np),
+        False,
+        RESULTS.diverged,
+    )
     state = solver.init(function, steps, system, {}, None, None, frozenset())
     number = 0
     while number < max_steps and not done:
@@ -332,7 +341,7 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
     """Everything that follows from the linearisation at the minimum."""
     problem = found.problem
     data, roles, members = problem.data, problem.roles, problem.members
-    system, steps = _System(problem, datum), origin(problem.data, problem.roles)
+    system, steps = _System(problem, datum), origin(problem.data, problem.roles, np)
     rows = residuals_of(problem)
     used = sum(
         int(np.sum(np.asarray(term.mask))) * r.shape[1]
@@ -365,10 +374,10 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
     q, crossed, corner = factored.select(problem.slots)
     room = np.zeros((roles.slots - len(q), *q.shape[1:]))
     options = {"data": data, "roles": roles}
-    of_slots = jnp.asarray(np.concatenate([q, room]))
-    solved = carried, of_slots, jnp.asarray(crossed), jnp.asarray(corner)
+    of_slots = jax.device_put(np.concatenate([q, room]))
+    solved = carried, of_slots, *jax.device_put((crossed, corner))
     of_points, redundancy = Program(read_solution, options, COMPILE_FAST)(solved)
-    pivot = min(factored.pivot, float(jnp.min(carried.pivots)))
+    pivot = min(factored.pivot, float(np.min(carried.pivots)))
     singular = pivot < SINGULAR
     squares = sum(float(np.sum(r**2)) for r in rows)
     return replace(

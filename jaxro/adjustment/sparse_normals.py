@@ -244,12 +244,14 @@ def read_solution(
     return Read(points, redundancy)
 
 
-def origin(data: Data, roles: Roles) -> Steps:
-    """No displacement."""
+def origin(data: Data, roles: Roles, xp: Any = jnp) -> Steps:
+    """No displacement; `xp`: the library of its arrays. NumPy compiles nothing for
+    every number of members."""
     sizes = dict(zip(roles.common, roles.common_sizes, strict=True))
     sizes |= {roles.eliminated: roles.point_size, roles.linked: roles.block_size}
     number = lambda name: jax.tree.leaves(data.families[name])[0].shape[0]
-    return {name: jnp.zeros((number(name), sizes[name])) for name in data.families}
+    zeros = lambda name: xp.zeros((number(name), sizes[name]))
+    return {name: zeros(name) for name in data.families}
 
 
 def _all_touched(data: Data, steps: Steps, roles: Roles) -> list[Touched]:

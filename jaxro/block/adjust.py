@@ -315,8 +315,8 @@ def prepare_block(
     number = known.of_points(len(block.points))
     numbered = number_points(block, number, use & there[block.point])
     parts = in_order(known, numbered)
-    inside = jnp.asarray(units.inside(start.centres))
-    stations = Station(jnp.asarray(start.quaternions), inside)
+    inside = units.inside(start.centres)
+    stations = Station(*jax.device_put((start.quaternions, inside)))
     points = units.inside(points[numbered.number >= 0])
     families = {"photo": stations, "point": points}
     if inner is not None:

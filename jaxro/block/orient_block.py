@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from ..adjustment import critical_values
 from ..batches.ragged import Ragged, clean_ragged
 from ..rejection import Recommended, Rejection
 from .adjust import BlockAdjustment
@@ -23,7 +22,7 @@ from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, from_pairs
 from .network import Start
 from .place import Placed, on_ground, place
-from .wrong import Wrong, adjust_without_wrong
+from .wrong import Wrong, adjust_without_wrong, fits
 
 
 class OrientedBlock(NamedTuple):
@@ -77,10 +76,10 @@ def orient_block(
     placed = place(block, chained, ground)
     start = start_from(block, on_ground(chained, placed))
     adjusted, wrong, found = adjust(start, leave_out(ground, placed.wrong))
-    fits = placed.wrong & _fits(adjusted, ground, level)
-    if np.any(fits):
+    back = placed.wrong & fits(adjusted, ground, level)
+    if np.any(back):
         # they stood out by the errors of the chain alone
-        placed = placed._replace(wrong=placed.wrong & ~fits)
+        placed = placed._replace(wrong=placed.wrong & ~back)
         left = leave_out(ground, placed.wrong)
         adjusted, wrong, found = adjust(adjusted.as_start, left)
     wrong = wrong._replace(control=wrong.control | placed.wrong[:, None])
@@ -117,17 +116,6 @@ def leave_out(ground: Ground, rows: Bool[np.ndarray, " known"]) -> Ground:
     """The ground without what is known of some rows, which keep their numbers."""
     at = np.where(rows[:, None], np.nan, ground.coordinates)
     return ground._replace(coordinates=at)
-
-
-def _fits(
-    adjusted: BlockAdjustment, ground: Ground, level: float
-) -> Bool[np.ndarray, " known"]:
-    """What is known and lies where the adjustment without it says."""
-    off, spread = adjusted.compare(ground)
-    z = np.abs(off) / np.hypot(spread, adjusted.sigma0 * ground.sigma)
-    each = critical_values.sidak(level, max(int(np.sum(np.isfinite(z))), 1))
-    known = np.any(np.isfinite(z), axis=1)
-    return known & np.all((z < critical_values.normal(each)) | np.isnan(z), axis=1)
 
 
 def _read(rejection: Rejection) -> tuple[tuple, tuple]:

@@ -79,13 +79,42 @@ def adjust_without_wrong(
     wrong = _far(prepared, found)
     begin = prepared.start_at(found)
     adjusted = adjust_rest(block, begin, ground, wrong, inner)
+    adjusted, wrong = _test(adjusted, ground, wrong, level)
+    if ground is None or not wrong.settled:
+        return adjusted, wrong
+    # robust estimators leave out what little else checks: it comes back, and is tested
+    back = np.any(wrong.control, axis=1) & fits(adjusted, ground, level)
+    if not np.any(back):
+        return adjusted, wrong
+    wrong = wrong._replace(control=wrong.control & ~back[:, None])
+    adjusted = adjust_rest(block, adjusted.as_start, ground, wrong, inner)
+    return _test(adjusted, ground, wrong, level)
+
+
+def _test(
+    adjusted: BlockAdjustment, ground: Ground | None, wrong: Wrong, level: float
+) -> tuple[BlockAdjustment, Wrong]:
+    """The adjustment without what the tests reject, in rounds."""
     for _ in range(TESTS):
         more = _worst(adjusted, normalise_residuals(adjusted, level))
         if not (np.any(more.rays) or np.any(more.control)):
             return adjusted, wrong._replace(settled=True)
         wrong = wrong | more
-        adjusted = adjust_rest(block, adjusted.as_start, ground, wrong, inner)
-    return adjusted, wrong
+        begin, inner = adjusted.as_start, adjusted.inner
+        adjusted = adjust_rest(adjusted.block, begin, ground, wrong, inner)
+    return adjusted, wrong._replace(settled=False)
+
+
+def fits(
+    adjusted: BlockAdjustment, ground: Ground, level: float
+) -> Bool[np.ndarray, " known"]:
+    """What of the ground lies where an adjustment without it says, all its coordinates
+    within the limit that the largest of all exceeds with the probability `level`."""
+    off, spread = adjusted.compare(ground)
+    z = np.abs(off) / np.hypot(spread, adjusted.sigma0 * ground.sigma)
+    each = critical_values.sidak(level, max(int(np.sum(np.isfinite(z))), 1))
+    known = np.any(np.isfinite(z), axis=1)
+    return known & np.all((z < critical_values.normal(each)) | np.isnan(z), axis=1)
 
 
 def adjust_rest(

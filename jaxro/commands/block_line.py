@@ -98,7 +98,7 @@ Models = Annotated[
 Seed = Annotated[
     int | None,
     typer.Option(
-        help="Of the simulated block: seed of its random numbers.  [default: 0]",
+        help="Of the simulated block: seed of its random numbers.  [default: 1]",
         metavar="N",
         min=0,
         show_default=False,

@@ -61,7 +61,7 @@ class SimulatedBlock:
         return "\n".join(lines) + "\n"
 
 
-def simulate(strips: int = 1, models: int = 6, seed: int = 0) -> SimulatedBlock:
+def simulate(strips: int = 1, models: int = 6, seed: int = 1) -> SimulatedBlock:
     """Strips of so many models each; a third of the known points within the block are
     check points."""
     flight = Flight(strips=strips, models=models)
