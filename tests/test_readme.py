@@ -199,9 +199,10 @@ def exists(place: str) -> bool:
     return True
 
 
-def test_decisions_name_places_in_the_code():
-    """The second column of benchmarks/decisions.md."""
-    text = (ROOT / "benchmarks" / "decisions.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize("name", ["decisions", "decisions-blocks"])
+def test_decisions_name_places_in_the_code(name):
+    """The second column of the tables of decisions."""
+    text = (ROOT / "benchmarks" / f"{name}.md").read_text(encoding="utf-8")
     rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| ")]
     places = [
         place for row in rows for place in re.findall(r"`([\w.]+)`", row[1]) if row[2:]
