@@ -8,6 +8,7 @@ from .absolute_model import (
 )
 from .absolute_result import AbsoluteOrientation as AbsoluteOrientation
 from .adjust import BlockAdjustment as BlockAdjustment, adjust_block as adjust_block
+from .bars import Bars as Bars, bars as bars
 from .chain import Unjoined as Unjoined, chain as chain, models_of as models_of
 from .inner import Inner as Inner
 from .measured_block import (

@@ -26,6 +26,7 @@ from ..calibration.camera import Station
 from ..geometry import rotations as rot
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
+from .bars import Bars, NoBar, bar_terms
 from .datum import free_datum
 from .inner import Inner, InnerParameters, cameras_of, in_photo_units
 from .measured_block import Ground, MeasuredBlock, nothing_known
@@ -57,6 +58,7 @@ class BlockAdjustment:
     numbered: Numbered
     known: tuple[KnownCoordinates, ...]
     inner: Inner | None
+    bars: Bars | None
     adjustment: SparseAdjustment
 
     @property
@@ -217,15 +219,33 @@ class BlockAdjustment:
     @property
     def control_residuals(self) -> Float[np.ndarray, "known 3"]:
         """What would have to be added to the known coordinates."""
-        white = [np.asarray(r)[:, 0] for r in self.adjustment.residuals[1:]]
+        white = self._of_known(self.adjustment.residuals)
         both = zip(white, self.known, strict=True)
         return self._of_control([r * part.sigma for r, part in both])
 
     @property
     def control_redundancy(self) -> Float[np.ndarray, "known 3"]:
         """The redundancy numbers of the known coordinates."""
-        found = self.adjustment.redundancy[1:]
-        return self._of_control([np.asarray(r)[:, 0] for r in found])
+        return self._of_control(self._of_known(self.adjustment.redundancy))
+
+    @property
+    def bar_residuals(self) -> Float[np.ndarray, " bar"]:
+        """What would have to be added to the lengths of the `bars`."""
+        if self.bars is None:
+            return np.zeros(0)
+        return np.asarray(self.adjustment.residuals[-1])[:, 0] * self.bars.sigma
+
+    @property
+    def bar_redundancy(self) -> Float[np.ndarray, " bar"]:
+        """The redundancy numbers of the lengths."""
+        if self.bars is None:
+            return np.zeros(0)
+        return np.asarray(self.adjustment.redundancy[-1])[:, 0]
+
+    def _of_known(self, values: list[np.ndarray]) -> list[np.ndarray]:
+        """Those of the terms of known coordinates, which come after that of the
+        rays."""
+        return [np.asarray(a)[:, 0] for a in values[1 : 1 + len(self.known)]]
 
     def _of_rays(self, values: np.ndarray) -> np.ndarray:
         out = np.full((len(self.block.photo), 2), np.nan)
@@ -247,6 +267,7 @@ class Prepared(NamedTuple):
     numbered: Numbered
     known: tuple[KnownCoordinates, ...]
     inner: Inner | None
+    bars: Bars | None
     problem: Problem
     datum: DatumOf | None
 
@@ -283,16 +304,17 @@ def adjust_block(
     ground: Ground | None = None,
     inner: Inner | None = None,
     left_out: Bool[np.ndarray, " ray"] | None = None,
+    bars: Bars | None = None,
 ) -> BlockAdjustment:
     """Adjust a block from approximate stations and points.
 
     `inner`: the inner parameters of the cameras that are unknown, too; `left_out`: rays
-    that take no part, but keep their numbers. Without known
+    that take no part, but keep their numbers; `bars`: known distances. Without known
     coordinates the network is free: its datum is that of the approximate stations
     (inner constraints). Points on one photo, of which nothing else is known, are left
     out. Failures are values of `adjustment.result`.
     """
-    prepared = prepare_block(block, start, ground, inner, left_out)
+    prepared = prepare_block(block, start, ground, inner, left_out, bars)
     return conclude(prepared, minimise(prepared.problem, datum=prepared.datum))
 
 
@@ -302,6 +324,7 @@ def prepare_block(
     ground: Ground | None = None,
     inner: Inner | None = None,
     left_out: Bool[np.ndarray, " ray"] | None = None,
+    bars: Bars | None = None,
 ) -> Prepared:
     """The problem of a block at its approximate values, some rays left out."""
     units = frame_of(start)
@@ -324,6 +347,12 @@ def prepare_block(
         zero = np.zeros((cameras, len(inner.free)))
         families["camera"] = zero if start.inner is None else start.inner
     terms = terms_of(block, numbered, parts, units, inner)
+    if bars is not None:
+        bars, between = _bars_in(bars, block, numbered)
+        families["end"] = points[between[1]]
+        spread = float(np.median(block.sigma / block.focal[block.photo]))
+        lengths = bars.length / units.length, bars.sigma / units.length
+        terms = *terms, *bar_terms(between, *lengths, spread)
     problem = prepare(terms, families, eliminate="point", linked="photo")
     return Prepared(
         block=block,
@@ -332,9 +361,24 @@ def prepare_block(
         numbered=numbered,
         known=parts,
         inner=inner,
+        bars=bars,
         problem=problem,
-        datum=None if parts else free_datum(stations),
+        datum=None if parts else free_datum(stations, has_scale=bars is not None),
     )
+
+
+def _bars_in(
+    bars: Bars, block: MeasuredBlock, numbered: Numbered
+) -> tuple[Bars, tuple[np.ndarray, np.ndarray]]:
+    """The bars between points of the adjustment, and the numbers of these there. Raises
+    `NoBar` where there are none."""
+    one, other = bars.numbers_in(block)
+    of = lambda point: np.where(point < 0, -1, numbered.number[np.maximum(point, 0)])
+    one, other = of(one), of(other)
+    there = (one >= 0) & (other >= 0)
+    if not np.any(there):
+        raise NoBar("adjust_block: no bar has both of its points in the block")
+    return bars.take(there), (one[there], other[there])
 
 
 def conclude(prepared: Prepared, found: Minimum) -> BlockAdjustment:
@@ -346,6 +390,7 @@ def conclude(prepared: Prepared, found: Minimum) -> BlockAdjustment:
         numbered=prepared.numbered,
         known=prepared.known,
         inner=prepared.inner,
+        bars=prepared.bars,
         adjustment=read(found, prepared.datum),
     )
 

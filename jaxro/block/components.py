@@ -1,5 +1,5 @@
 """Variance components of a block: by which factors the stated standard deviations of
-places, known points and known stations are to be multiplied, so that each group agrees
+places, known points, known stations and scale bars are to be multiplied, so that each group agrees
 with its own residuals.
 
     s² = Σ v² / sigma² / Σ r    over the group, r the redundancy numbers
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from .adjust import BlockAdjustment, adjust_block
+from .bars import Bars
 from .inner import Inner
 from .measured_block import Ground, MeasuredBlock
 from .network import Start
@@ -28,7 +29,7 @@ RESTS = 1e-3
 LEAST = 1.0
 """Redundancy of a group that tells its factor; with less it keeps what was stated."""
 
-GROUPS = ("places", "control", "stations")
+GROUPS = ("places", "control", "stations", "bars")
 
 
 class Component(NamedTuple):
@@ -50,8 +51,9 @@ def components_of(adjusted: BlockAdjustment) -> dict[str, Component]:
     adjustment."""
     kinds = ["stations" if part.station[0] else "control" for part in adjusted.known]
     found = adjusted.adjustment
-    groups = zip(("places", *kinds), found.residuals, found.redundancy, strict=True)
-    return {name: _component(v, r) for name, v, r in groups}
+    names = ["places", *kinds, *(() if adjusted.bars is None else ("ties", "bars"))]
+    groups = zip(names, found.residuals, found.redundancy, strict=True)
+    return {name: _component(v, r) for name, v, r in groups if name != "ties"}
 
 
 def _component(white: np.ndarray, redundancy: np.ndarray) -> Component:
@@ -68,12 +70,13 @@ def adjust_with_components(
     ground: Ground | None = None,
     inner: Inner | None = None,
     left_out: Bool[np.ndarray, " ray"] | None = None,
+    bars: Bars | None = None,
 ) -> tuple[BlockAdjustment, dict[str, Component]]:
     """The adjustment with the standard deviations of each group as its residuals tell
     them, and the factors that lead there from what was stated. Wrong places (`left_out`)
     and wrong known coordinates, which are NaN, are to be found before."""
     factors, silent = dict.fromkeys(GROUPS, 1.0), set()
-    adjusted = adjust_block(block, start, ground, inner, left_out)
+    adjusted = adjust_block(block, start, ground, inner, left_out, bars)
     found = components_of(adjusted)
     for _ in range(ROUNDS):
         # a group without redundancy would shrink to nothing: it stays as stated
@@ -84,8 +87,9 @@ def adjust_with_components(
         silent |= lost
         factors |= {name: factors[name] * one.factor for name, one in told.items()}
         factors |= dict.fromkeys(lost, 1.0)
-        scaled, known = multiply(block, ground, factors)
-        adjusted = adjust_block(scaled, adjusted.as_start, known, inner, left_out)
+        places, known, lengths = multiply(block, ground, bars, factors)
+        begin = adjusted.as_start
+        adjusted = adjust_block(places, begin, known, inner, left_out, lengths)
         found = components_of(adjusted)
     of = lambda name, one: (
         Component(1.0, np.inf, one.redundancy)
@@ -96,11 +100,16 @@ def adjust_with_components(
 
 
 def multiply(
-    block: MeasuredBlock, ground: Ground | None, factors: Mapping[str, float]
-) -> tuple[MeasuredBlock, Ground | None]:
-    """Block and ground with the standard deviations of each group multiplied."""
+    block: MeasuredBlock,
+    ground: Ground | None,
+    bars: Bars | None,
+    factors: Mapping[str, float],
+) -> tuple[MeasuredBlock, Ground | None, Bars | None]:
+    """Everything with the standard deviations of each group multiplied."""
     block = block._replace(sigma=block.sigma * factors["places"])
-    if ground is None:
-        return block, None
-    of_rows = np.where(ground.station, factors["stations"], factors["control"])
-    return block, ground._replace(sigma=ground.sigma * of_rows[:, None])
+    if bars is not None:
+        bars = bars._replace(sigma=bars.sigma * factors["bars"])
+    if ground is not None:
+        of_rows = np.where(ground.station, factors["stations"], factors["control"])
+        ground = ground._replace(sigma=ground.sigma * of_rows[:, None])
+    return block, ground, bars

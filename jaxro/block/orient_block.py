@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from ..batches.ragged import Ragged, clean_ragged
 from ..rejection import Recommended, Rejection
 from .adjust import BlockAdjustment
+from .bars import Bars
 from .chain import Chained, Oriented, chain, intersect, models_of
 from .components import (
     GROUPS,
@@ -46,6 +47,7 @@ def orient_block(
     more: MeasuredBlock | None = None,
     *,
     inner: Inner | None = None,
+    bars: Bars | None = None,
     level: float = 0.05,
     components: bool = False,
 ) -> OrientedBlock:
@@ -55,6 +57,7 @@ def orient_block(
     `left`, `right`: the photos of each pair, in any order and direction; `points`: the
     names of all rows of `pairs`; `more`: the block with further rays, such as known
     points on one photo; `inner`: the inner parameters of the cameras that are unknown;
+    `bars`: known distances;
     `level`: the probability that anything is called wrong if nothing is; `components`:
     adjust with the standard deviations of places, known points and known stations as
     the residuals tell them. Without `ground` the network is free, its base lengths as the
@@ -70,9 +73,12 @@ def orient_block(
     )
     chained = chain(block, models)
     usable = np.asarray(oriented.usable)
-    adjust = partial(_adjust, block, inner=inner, level=level, components=components)
+    rest = {"inner": inner, "bars": bars, "level": level, "components": components}
+    adjust = partial(_adjust, block, **rest)
     if ground is None:
-        return OrientedBlock(*adjust(start_from(block, chained)), None, usable)
+        start = start_from(block, chained)
+        start = start if bars is None else to_bars(block, start, bars)
+        return OrientedBlock(*adjust(start), None, usable)
     placed = place(block, chained, ground)
     start = start_from(block, on_ground(chained, placed))
     adjusted, wrong, found = adjust(start, leave_out(ground, placed.wrong))
@@ -92,12 +98,13 @@ def _adjust(
     ground: Ground | None = None,
     *,
     inner: Inner | None,
+    bars: Bars | None,
     level: float,
     components: bool,
 ) -> tuple[BlockAdjustment, Wrong, dict[str, Component]]:
     """The adjustment without what is wrong, and its variance components; with them, if
     they are asked for, what is wrong is looked for once more."""
-    adjusted, wrong = adjust_without_wrong(block, start, ground, inner, level)
+    adjusted, wrong = adjust_without_wrong(block, start, ground, inner, bars, level)
     if not components:
         return adjusted, wrong, components_of(adjusted)
     known = None
@@ -105,10 +112,11 @@ def _adjust(
         at = np.where(wrong.control, np.nan, ground.coordinates)
         known = ground._replace(coordinates=at)
     start = adjusted.as_start
-    _, found = adjust_with_components(block, start, known, inner, wrong.rays)
+    rest = inner, wrong.rays, bars
+    _, found = adjust_with_components(block, start, known, *rest)
     factors = dict.fromkeys(GROUPS, 1.0) | {n: one.factor for n, one in found.items()}
-    scaled = multiply(block, ground, factors)
-    adjusted, wrong = adjust_without_wrong(scaled[0], start, scaled[1], inner, level)
+    block, ground, bars = multiply(block, ground, bars, factors)
+    adjusted, wrong = adjust_without_wrong(block, start, ground, inner, bars, level)
     return adjusted, wrong, found
 
 
@@ -122,6 +130,16 @@ def _read(rejection: Rejection) -> tuple[tuple, tuple]:
     """The `Oriented` of a pair, and nothing of its points."""
     found = rejection.orientation
     return (found.pose, found.cofactor, found.usable), ()
+
+
+def to_bars(block: MeasuredBlock, start: Start, bars: Bars) -> Start:
+    """Approximate values in the scale of the bars: of the median of their ratios."""
+    one, other = bars.numbers_in(block)
+    there = (one >= 0) & (other >= 0)
+    apart = start.points[one[there]] - start.points[other[there]]
+    ratios = bars.length[there] / np.linalg.norm(apart, axis=1)
+    scale = np.nanmedian(ratios) if np.any(np.isfinite(ratios)) else 1.0
+    return start._replace(centres=start.centres * scale, points=start.points * scale)
 
 
 def start_from(block: MeasuredBlock, chained: Chained) -> Start:

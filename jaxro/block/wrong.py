@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from ..adjustment import critical_values
 from ..adjustment.sparse import Minimum, Problem, minimise, residuals_of
 from .adjust import BlockAdjustment, Prepared, adjust_block, prepare_block
+from .bars import Bars
 from .inner import Inner
 from .measured_block import Ground, MeasuredBlock
 from .network import Start, spread_known
@@ -69,16 +70,17 @@ def adjust_without_wrong(
     start: Start,
     ground: Ground | None = None,
     inner: Inner | None = None,
+    bars: Bars | None = None,
     level: float = 0.05,
 ) -> tuple[BlockAdjustment, Wrong]:
     """Adjust a block without its wrong rays and known coordinates. `inner`: the inner
-    parameters that are unknown. Raises `TooLittleControl` where hardly a known
-    coordinate fits the photos."""
-    prepared = prepare_block(block, start, ground, inner)
+    parameters that are unknown; `bars`: known distances. Raises `TooLittleControl`
+    where hardly a known coordinate fits the photos."""
+    prepared = prepare_block(block, start, ground, inner, bars=bars)
     found = settle(prepared)
     wrong = _far(prepared, found)
     begin = prepared.start_at(found)
-    adjusted = adjust_rest(block, begin, ground, wrong, inner)
+    adjusted = adjust_rest(block, begin, ground, wrong, inner, bars)
     adjusted, wrong = _test(adjusted, ground, wrong, level)
     if ground is None or not wrong.settled:
         return adjusted, wrong
@@ -87,7 +89,7 @@ def adjust_without_wrong(
     if not np.any(back):
         return adjusted, wrong
     wrong = wrong._replace(control=wrong.control & ~back[:, None])
-    adjusted = adjust_rest(block, adjusted.as_start, ground, wrong, inner)
+    adjusted = adjust_rest(block, adjusted.as_start, ground, wrong, inner, bars)
     return _test(adjusted, ground, wrong, level)
 
 
@@ -100,8 +102,8 @@ def _test(
         if not (np.any(more.rays) or np.any(more.control)):
             return adjusted, wrong._replace(settled=True)
         wrong = wrong | more
-        begin, inner = adjusted.as_start, adjusted.inner
-        adjusted = adjust_rest(adjusted.block, begin, ground, wrong, inner)
+        begin, rest = adjusted.as_start, (adjusted.inner, adjusted.bars)
+        adjusted = adjust_rest(adjusted.block, begin, ground, wrong, *rest)
     return adjusted, wrong._replace(settled=False)
 
 
@@ -123,13 +125,14 @@ def adjust_rest(
     ground: Ground | None,
     wrong: Wrong,
     inner: Inner | None = None,
+    bars: Bars | None = None,
 ) -> BlockAdjustment:
     """The adjustment without what is wrong; rays and points keep their numbers."""
     if ground is not None:
         at = np.where(wrong.control, np.nan, ground.coordinates)
         _check_control(ground, at)
         ground = ground._replace(coordinates=at)
-    return adjust_block(block, start, ground, inner, wrong.rays)
+    return adjust_block(block, start, ground, inner, wrong.rays, bars)
 
 
 def _check_control(ground: Ground, left: Float[np.ndarray, "known 3"]) -> None:
@@ -206,8 +209,8 @@ def _far(prepared: Prepared, found: Minimum) -> Wrong:
     far, *of_known = [sizes > CLEAR for sizes in _sizes(found.problem)]
     rays = np.zeros(len(prepared.block.photo), bool)
     rays[prepared.numbered.rays] = far
-    number = _control_points(prepared.ground)
-    return Wrong(rays, spread_known(prepared.known, of_known, number, False))
+    known, number = prepared.known, _control_points(prepared.ground)
+    return Wrong(rays, spread_known(known, of_known[: len(known)], number, False))
 
 
 def _worst(adjusted: BlockAdjustment, tested: Tested) -> Wrong:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..batches.ragged import Ragged
+from ..block.bars import Bars, NoBar
 from ..block.chain import Unjoined
 from ..block.inner import Inner
 from ..block.measured_block import (
@@ -23,7 +24,13 @@ from ..reports import block as report
 from ..reports.block_files import contents
 from ..reports.block_model import Done
 from ..reports.terminal import consoles, say_what
-from ..tables import csv as csv_tables, ground as ground_tables, images, whole
+from ..tables import (
+    bars as bar_tables,
+    csv as csv_tables,
+    ground as ground_tables,
+    images,
+    whole,
+)
 from ..tables.cameras import Cameras
 from ..tables.examples import block as example
 from ..tables.fields import TableError
@@ -49,6 +56,7 @@ class Options:
     control: Path | None = None
     control_sigma: float | None = None
     rays: Path | None = None
+    bars: Path | None = None
     inner: str | None = None
     components: bool = False
     level: float = 0.05
@@ -68,7 +76,7 @@ class Options:
     def read(self) -> tuple[Path | None, ...]:
         """The files that are read."""
         own = self.measured
-        return own.file, own.camera, self.control, self.rays
+        return own.file, own.camera, self.control, self.rays, self.bars
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,7 @@ class Task:
     sigma: str
     ground: Ground | None = None
     more: MeasuredBlock | None = None
+    bars: Bars | None = None
     approximate: int = 0
 
 
@@ -164,6 +173,7 @@ def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
         points=list(map(str, to_list(table.points))),
         sigma=told,
         ground=ground,
+        bars=_bars(options),
         approximate=approximate,
     )
     return _with_rays(task, options, table, cameras), {}
@@ -182,7 +192,7 @@ def _check(options: Options) -> None:
         raise TableError(
             "--level", found=repr(options.level), expected="a probability such as 0.05"
         )
-    if options.control is None and value is not None:
+    if options.control is None and options.bars is None and value is not None:
         raise TableError(
             "--control-sigma",
             found="it without --control",
@@ -192,6 +202,7 @@ def _check(options: Options) -> None:
         given = {
             "--control": options.control,
             "--rays": options.rays,
+            "--bars": options.bars,
             "--camera": own.camera,
             "--focal": own.focal,
             "--sigma": own.sigma,
@@ -252,6 +263,14 @@ def _read(options: Options) -> Table:
             expected="each point once in a pair; rename it or delete one of the two",
         )
     return table
+
+
+def _bars(options: Options) -> Bars | None:
+    """The scale bars. Raises TableError."""
+    if options.bars is None:
+        return None
+    own = options.measured
+    return bar_tables.read(options.bars, options.control_sigma, own.semicolons)
 
 
 def _cameras(options: Options, table: Table) -> Cameras:
@@ -447,6 +466,7 @@ def calculate(task: Task, options: Options) -> Done:
                 task.ground,
                 more=task.more,
                 inner=inner_of(options.inner),
+                bars=task.bars,
                 level=options.level,
                 components=options.components,
             )
@@ -463,7 +483,13 @@ def calculate(task: Task, options: Options) -> Done:
             found="control that does not place the block",
             expected=f"more of it. {error}",
         ) from None
-    network = task.ground is None
+    except NoBar as error:
+        raise TableError(
+            options.bars or "--bars",
+            found="no bar with both of its points on two photos or more",
+            expected=f"names of {task.title}: {_some(sorted(set(task.points)))}",
+        ) from error
+    network = task.ground is None and task.bars is None
     return Done(
         title=task.title,
         unit="units" if network else options.unit,

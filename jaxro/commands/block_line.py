@@ -45,6 +45,16 @@ Sigma = Annotated[
         show_default=False,
     ),
 ]
+BarTable = Annotated[
+    Path | None,
+    typer.Option(
+        "--bars",
+        help="CSV table of known distances between points: from,to,length, and sigma or "
+        "--control-sigma.",
+        metavar="BARS.csv",
+        show_default=False,
+    ),
+]
 InnerNames = Annotated[
     str | None,
     typer.Option(
@@ -133,6 +143,7 @@ def block(
     control: Control = None,
     control_sigma: ControlSigma = None,
     rays: Rays = None,
+    bars: BarTable = None,
     camera: given.Camera = None,
     focal: given.Focal = None,
     principal_point: given.PrincipalPoint = None,
@@ -179,6 +190,7 @@ def block(
         control=control,
         control_sigma=control_sigma,
         rays=rays,
+        bars=bars,
         inner=inner,
         components=components,
         level=level,

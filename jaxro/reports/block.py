@@ -32,6 +32,7 @@ def show(console: Console, done: Done) -> None:
         _photos(console, done)
         _control(console, done)
         _checks(console, done)
+        _bars(console, done)
     for sentence in sentences(done):
         console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
 
@@ -48,6 +49,8 @@ def _head(console: Console, done: Done) -> None:
     told = ", ".join(f"{np.sum(k)} {name}" for name, k in kinds.items() if np.any(k))
     ground = "free network" if done.ground is None else f"control {told or 'none'}"
     checks = f"; {len(done.checks.names)} check points" if done.ground else ""
+    if done.adjusted.bars is not None:
+        checks += f"; {len(done.adjusted.bars.one)} scale bars"
     console.print(
         f"[bold]Block of {escape(done.title)}[/bold], {len(block.photos)} photos in "
         f"{len(done.pairs)} pairs, {np.sum(done.determined)} points on {len(block.x)} "
@@ -230,6 +233,31 @@ def _checks(console: Console, done: Done) -> None:
     left_out(console, len(done.checks.names), "points, those with the largest shown")
 
 
+def _bars(console: Console, done: Done) -> None:
+    bars, found = done.adjusted.bars, done.adjusted
+    if bars is None:
+        return
+    title = f"Scale bars: adjusted minus given [{done.unit}], redundancy r"
+    rows = table("from", "to", "length", "d", "r", "|w|", title=title)
+    rows.columns[1].justify = "left"
+    sizes = done.bar_tests
+    decimals = digits(float(np.median(bars.sigma)), 1)
+    every = zip(
+        bars.one,
+        bars.other,
+        bars.length,
+        found.bar_residuals,
+        found.bar_redundancy,
+        sizes,
+        strict=True,
+    )
+    for one, other, length, residual, redundancy, w in every:
+        cells = number(length, decimals), number(residual, decimals + 1)
+        tests = number(redundancy, 2), number(abs(w), 2)
+        rows.add_row(escape(one), escape(other), *cells, *tests)
+    console.print(rows)
+
+
 # -------------------------------------------------------------------------------------
 # what to mind
 
@@ -285,8 +313,9 @@ def _of_fit(done: Done) -> list[str]:
 
 def _of_control(done: Done) -> list[str]:
     if done.ground is None:
+        scale = " and scale" if done.adjusted.bars is None else ""
         return [
-            "Without known points the block has any position and scale; standard "
+            f"Without known points the block has any position{scale}; standard "
             "deviations refer to its stations as a whole (inner constraints)."
         ]
     used = done.control.known & ~done.wrong_control

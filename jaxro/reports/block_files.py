@@ -27,6 +27,7 @@ def tables(done: Done) -> dict[str, Columns]:
         "control": _control(done),
         "residuals": _residuals(done),
         "cameras": _cameras(done),
+        "bars": _bars(done),
         "photo_covariances": _photo_covariances(done),
         "point_covariances": _point_covariances(done),
     }
@@ -115,6 +116,22 @@ def _cameras(done: Done) -> Columns:
         "parameter": list(found.names) * len(found.values),
         "value": found.values.ravel(),
         "sd": found.deviations.ravel(),
+    }
+
+
+def _bars(done: Done) -> Columns:
+    """The scale bars; w is empty where nothing checks them."""
+    bars = done.adjusted.bars
+    if bars is None:
+        return {"from": []}
+    return {
+        "from": list(bars.one),
+        "to": list(bars.other),
+        "length": bars.length,
+        "sigma": bars.sigma,
+        "v": done.adjusted.bar_residuals,
+        "redundancy": done.adjusted.bar_redundancy,
+        "w": done.bar_tests,
     }
 
 

@@ -12,7 +12,7 @@ from ..adjustment import RESULTS, critical_values as critical
 from ..block.adjust import BlockAdjustment
 from ..block.measured_block import Ground
 from ..block.orient_block import OrientedBlock
-from ..block.wrong import Tested, normalise_residuals
+from ..block.wrong import UNCHECKED, Tested, normalise_residuals
 from .control import LEVEL, Compared
 
 LEAST = 1e-12
@@ -157,6 +157,16 @@ class Done:
             return self._compare(np.zeros(0, int), np.zeros((0, 3)))
         rows = self._rows(self.ground.check)
         return self._compare(rows, self._ratios[rows])
+
+    @property
+    def bar_tests(self) -> Float[np.ndarray, " bar"]:
+        """w of the scale bars, NaN where nothing checks them."""
+        if self.adjusted.bars is None:
+            return np.zeros(0)
+        r = self.adjusted.bar_redundancy
+        unit = self.adjusted.sigma0 * self.adjusted.bars.sigma
+        w = self.adjusted.bar_residuals / (unit * np.sqrt(np.maximum(r, UNCHECKED)))
+        return np.where(r > UNCHECKED, w, np.nan)
 
     @property
     def limit_of_checks(self) -> float:

@@ -1,5 +1,5 @@
-"""Inner parameters as unknowns, known stations, and variance components of a block: by
-simulation with known truth."""
+"""Inner parameters as unknowns, known stations, scale bars, and variance components of a
+block: by simulation with known truth."""
 
 import numpy as np
 import pytest
@@ -131,3 +131,50 @@ def test_variance_components_find_what_was_stated_wrong():
     np.testing.assert_allclose(np.mean(factors, axis=0), [0.5, 4.0], rtol=0.05)
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert np.all((rms > 0.4) & (rms < 1.6))
+
+
+def test_scale_bars_are_those_of_a_dense_update():
+    """Two bars in a network with control: what they change is the update of its joint
+    covariance in NumPy, and their redundancies follow from it."""
+    mock = block.mock_block(7, Flight(models=3))
+    measured, start = mock.block, start_from(mock.block, mock.photos)
+    plain = adjust_block(measured, start, mock.ground).check()
+    names = [("t7", "t20"), ("t9", "t16")]
+    numbers = [[measured.points.index(name) for name in pair] for pair in names]
+    true = [np.linalg.norm(mock.points[a] - mock.points[b]) for a, b in numbers]
+    length = np.array(true) + np.array([0.02, -0.01])
+    given = block.bars(*zip(*names, strict=True), length, 0.03)
+    found = adjust_block(measured, start, mock.ground, bars=given).check()
+    assert found.degrees_of_freedom == plain.degrees_of_freedom + 2
+    total = np.nansum(found.redundancy) + np.nansum(found.control_redundancy)
+    total += np.sum(found.bar_redundancy)
+    np.testing.assert_allclose(total, found.degrees_of_freedom, rtol=1e-6)
+    apart = found.coordinates[[a for a, _ in numbers]]
+    apart = apart - found.coordinates[[b for _, b in numbers]]
+    length = np.linalg.norm(apart, axis=1)
+    np.testing.assert_allclose(length - given.length, found.bar_residuals, atol=1e-7)
+    # bars without weight change nothing
+    weak = given._replace(sigma=given.sigma * 1e6)
+    same = adjust_block(measured, start, mock.ground, bars=weak).check()
+    np.testing.assert_allclose(same.coordinates, plain.coordinates, atol=1e-6)
+    np.testing.assert_allclose(same.bar_redundancy, 1, atol=1e-6)
+
+
+def test_bars_give_a_free_network_its_scale():
+    mock = block.mock_block(8, Flight(strips=2, models=5))
+    left, right, pairs, points = block.pairs_of(mock.block)
+    at = dict(zip(mock.block.points, mock.points, strict=True))
+    names = [("t20", "t60"), ("t30", "t70"), ("c0", "c3")]
+    length = np.array([np.linalg.norm(at[a] - at[b]) for a, b in names])
+    given = block.bars(*zip(*names, strict=True), length, 0.01)
+    found = block.orient_block(left, right, pairs, points, bars=given).adjusted
+    free = block.orient_block(left, right, pairs, points).adjusted
+    # one distance for the scale, two that are checked
+    assert found.degrees_of_freedom == free.degrees_of_freedom + 2
+    now = dict(zip(found.block.points, found.coordinates, strict=True))
+    one, other = "t10", "t64"
+    true = np.linalg.norm(at[one] - at[other])
+    assert np.linalg.norm(now[one] - now[other]) == pytest.approx(true, rel=2e-4)
+    with pytest.raises(ValueError, match="no bar has both"):
+        strange = given._replace(one=("a", "b", "c"))
+        adjust_block(found.block, found.as_start, bars=strange)

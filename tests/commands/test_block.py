@@ -179,6 +179,26 @@ def test_stations_inner_parameters_and_components(tables, tmp_path):
     assert set(summary["components"]) == {"places", "control", "stations"}
 
 
+def test_scale_bars_without_control(tables, tmp_path):
+    ground = {row["point"]: row for row in rows(tables[1])}
+    at = {name: numbers([row], *AXES)[0] for name, row in ground.items()}
+    length = np.linalg.norm(at["c0"] - at["c5"])
+    text = f"from,to,length,sigma\nc0,c5,{length},0.02\nc1,c4,3000.0,5000\n"
+    bars = write(tmp_path, text, "bars.csv")
+    out = tmp_path / "out"
+    told = block((tables[0], None), "--bars", bars, "--out", out)
+    assert told.exit_code == 0, told.output
+    assert "free network; 2 scale bars" in words(told.stdout)
+    points = {
+        row["point"]: numbers([row], *AXES)[0] for row in rows(out / "points.csv")
+    }
+    across = np.linalg.norm(at["c1"] - at["c4"])
+    found = np.linalg.norm(points["c1"] - points["c4"])
+    assert found == pytest.approx(across, rel=1e-3)
+    weak = rows(out / "bars.csv")[1]
+    assert float(weak["redundancy"]) > 0.999
+
+
 def json_of(tables, out, *more):
     told = block(tables, "--out", out, *more)
     assert told.exit_code == 0, told.output
@@ -324,12 +344,15 @@ def test_options_without_their_table(arguments, said):
     [
         (("--models", "3"), "--models: found it beside a table"),
         (("--control-sigma", "0.1"), "found it beside the standard deviations"),
+        (("--bars", "BARS"), "found no bar with both of its points"),
         (("--rays", "RAYS"), "column photo: found 'strange'; expected a photo of"),
     ],
 )
 def test_options_that_do_not_fit_the_tables(tables, arguments, said, tmp_path):
     rays = write(tmp_path, "photo,point,x,y\nstrange,1,2,3\n", "rays.csv")
-    told = block(tables, *(rays if a == "RAYS" else a for a in arguments))
+    bars = write(tmp_path, "from,to,length,sigma\na,b,1,0.1\n", "bars.csv")
+    files = {"RAYS": rays, "BARS": bars}
+    told = block(tables, *(files.get(a, a) for a in arguments))
     assert told.exit_code == 2 and said in words(told.stderr)
 
 
