@@ -10,7 +10,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .parameters import as_given, as_parameters
@@ -21,7 +20,7 @@ Families = Mapping[str, Any]
 """Parameters by the name of their family: `AbstractParameters` or trees of numbers,
 members on the first axis."""
 
-Steps = dict[str, Float[Array | np.ndarray, "_ _"]]
+Steps = dict[str, Float[Array, "_ _"]]
 """A displacement of every member of every family, (member, d)."""
 
 

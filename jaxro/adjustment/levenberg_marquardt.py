@@ -8,14 +8,12 @@ A step that does not reduce the sum of squares is not taken, and λ grows (Marqu
 Gauss-Newton.
 """
 
-import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
@@ -24,7 +22,7 @@ from ..xla.programs import Program, is_traced
 from ..xla.settings import COMPILE_FAST
 from . import symmetric
 
-Scalar = Float[Array | np.ndarray | np.generic, ""]
+Scalar = Float[Array, ""]
 
 INVISIBLE = 1e-10
 """Part of the sum of squares that a step may promise and rounding may hide: such a step
@@ -81,7 +79,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             if known
             else _damped(fn, y, args, state.damping)
         )
-        back = jax.tree.map(operator.neg, found.step)
+        back = _at_once(_negative, found.step)
         moved = args.further(y, back) if known else jax.tree.map(jnp.add, y, back)
         squares = _at_once(_squares, fn(moved, args)[0])
         data = state, found, y, moved, squares
@@ -101,6 +99,10 @@ def _at_once(function: Callable, data: PyTree, **options: float) -> Any:
     if is_traced(data):
         return function(data, **options)
     return Program(function, options, COMPILE_FAST)(data)
+
+
+def _negative(step: PyTree) -> PyTree:
+    return jax.tree.map(jnp.negative, step)
 
 
 def _begin(squares: Scalar, damping: float) -> State:

@@ -238,7 +238,7 @@ def _weighted(term: Term, weight: Float[np.ndarray, " group"]) -> Term:
 
 def residuals_of(problem: Problem) -> list[Float[np.ndarray, "_ _"]]:
     """The whitened residuals of each term where the families stand."""
-    rows = _System(problem, None)(origin(problem.data, problem.roles, np))
+    rows = _System(problem, None)(_origin(problem))
     return [np.asarray(a)[:n] for a, n in zip(rows, problem.groups, strict=True)]
 
 
@@ -259,24 +259,21 @@ class _System:
         data, roles = self.problem.data, self.problem.roles
         factored, reduced, carried = self.factorise(steps, damping)
         x, c = factored.step(np.asarray(reduced.h), np.asarray(reduced.b))
-        x, c = jax.device_put((x, c))
-        back = Program(carry_back, {"data": data}, COMPILE_FAST)
-        y, decrement, spread = map(np.asarray, back((x, c, carried)))
-        # in NumPy, which compiles nothing for what follows
-        x, c, damping = (np.asarray(a) for a in (x, c, damping))
-        step = {roles.linked: x, roles.eliminated: y}
+        common = {}
         for k, name in enumerate(roles.common):
             own = steps[name].shape
             begin = roles.begin[k]
-            step[name] = c[begin : begin + own[0] * own[1]].reshape(own)
-        step = {name: step[name] for name in steps}
-        return promised(step, decrement, damping, spread)
+            common[name] = c[begin : begin + own[0] * own[1]].reshape(own)
+        x, c, common = jax.device_put((x, c, common))
+        back = Program(carry_back, {"data": data}, COMPILE_FAST)
+        y, decrement, spread = back((x, c, carried))
+        step = {roles.linked: x, roles.eliminated: y, **common}
+        whole = {name: step[name] for name in steps}, decrement, damping, spread
+        return Program(_promise, {}, COMPILE_FAST)(whole)
 
     def further(self, steps: Steps, step: Steps) -> Steps:
         """The displacements followed by a step."""
-        # by NumPy, which compiles nothing
-        add = lambda a, b: np.asarray(a) + np.asarray(b)
-        return jax.tree.map(add, steps, step)
+        return Program(_further, {}, COMPILE_FAST)((steps, step))
 
     def datum_at(self, steps: Steps) -> Datum:
         """The datum of the displaced families, with rows for the room of the linked
@@ -315,7 +312,7 @@ def minimise(
     solver = LevenbergMarquardt(rtol=SHORT, damping=FIRST_DAMPING)
     function = lambda steps, system: (system(steps), None)
     steps, done, result = (
-        origin(problem.data, problem.roles, np),
+        _origin(problem),
         False,
         RESULTS.diverged,
     )
@@ -341,7 +338,7 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
     """Everything that follows from the linearisation at the minimum."""
     problem = found.problem
     data, roles, members = problem.data, problem.roles, problem.members
-    system, steps = _System(problem, datum), origin(problem.data, problem.roles, np)
+    system, steps = _System(problem, datum), _origin(problem)
     rows = residuals_of(problem)
     used = sum(
         int(np.sum(np.asarray(term.mask))) * r.shape[1]
@@ -395,6 +392,24 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
         pivot=pivot,
         result=RESULTS.rank_deficient if singular else found.result,
     )
+
+
+# -------------------------------------------------------------------------------------
+# programs between those of `sparse_normals`: single operations would be compiled for
+# every number of members
+
+
+def _origin(problem: Problem) -> Steps:
+    """No displacement."""
+    return jax.device_put(origin(problem.data, problem.roles, np))
+
+
+def _promise(data: tuple) -> DampedStep:
+    return promised(*data)
+
+
+def _further(both: tuple[Steps, Steps]) -> Steps:
+    return jax.tree.map(jnp.add, *both)
 
 
 def trimmed(families: dict[str, Any], members: dict[str, int]) -> dict[str, Any]:

@@ -75,7 +75,8 @@ def adjust_with_components(
     """The adjustment with the standard deviations of each group as its residuals tell
     them, and the factors that lead there from what was stated. Wrong places (`left_out`)
     and wrong known coordinates, which are NaN, are to be found before."""
-    factors, silent = dict.fromkeys(GROUPS, 1.0), set()
+    factors: dict[str, float] = dict.fromkeys(GROUPS, 1.0)
+    silent: set[str] = set()
     adjusted = adjust_block(block, start, ground, inner, left_out, bars)
     found = components_of(adjusted)
     for _ in range(ROUNDS):

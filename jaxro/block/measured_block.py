@@ -156,7 +156,8 @@ def check_names(block: MeasuredBlock) -> MeasuredBlock:
     far = np.flatnonzero(apart > APART * block.focal[photo[first]])
     if len(far):
         at = first[far[0]]
-        raise TwoPoints(block.photos[photo[at]], block.points[point[at]], apart[far[0]])
+        names = block.photos[photo[at]], block.points[point[at]]
+        raise TwoPoints(*names, float(apart[far[0]]))
     return block
 
 
@@ -164,7 +165,7 @@ class TwoPoints(ValueError):
     """Two points of a photo have one name."""
 
     def __init__(self, photo: str, point: str, apart: float):
-        self.photo, self.point, self.apart = photo, point, float(apart)
+        self.photo, self.point, self.apart = photo, point, apart
         super().__init__(
             f"photo {photo!r} has two points with the name {point!r}, {apart:.3g} "
             "apart: rename one of them in all pairs where it is meant"

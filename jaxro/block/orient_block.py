@@ -86,8 +86,8 @@ def orient_block(
     if np.any(back):
         # they stood out by the errors of the chain alone
         placed = placed._replace(wrong=placed.wrong & ~back)
-        left = leave_out(ground, placed.wrong)
-        adjusted, wrong, found = adjust(adjusted.as_start, left)
+        begin, known = adjusted.as_start, leave_out(ground, placed.wrong)
+        adjusted, wrong, found = adjust(begin, known)
     wrong = wrong._replace(control=wrong.control | placed.wrong[:, None])
     return OrientedBlock(adjusted, wrong, found, placed, usable)
 

@@ -60,7 +60,7 @@ class Done:
     def usable(self) -> bool:
         """Whether the numbers may be used."""
         settled = self.oriented.wrong.settled
-        return self.adjusted.result == RESULTS.successful and settled
+        return bool(self.adjusted.result == RESULTS.successful) and settled
 
     @cached_property
     def tested(self) -> Tested:
