@@ -15,14 +15,15 @@ factorises this matrix (`sparse_factor`). The numbers are those of `adjust` with
 same terms.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
@@ -33,6 +34,8 @@ from .levenberg_marquardt import DampedStep, LevenbergMarquardt, promised
 from .normal_equations import SINGULAR
 from .results import RESULTS
 from .sparse_factor import (
+    Carried,
+    Cofactors,
     Datum,
     Factored,
     Reduced,
@@ -43,14 +46,15 @@ from .sparse_factor import (
     room_for,
 )
 from .sparse_normals import (
-    Carried,
     Data,
     Roles,
+    Shifts,
+    Solved,
     all_residuals,
     carry_back,
-    origin,
     read_solution,
     reduce_normals,
+    shapes,
 )
 from .terms import Term
 
@@ -70,28 +74,6 @@ the square of it."""
 
 DatumOf = Callable[[Families], Datum]
 """What a free network is referred to, of the displaced families."""
-
-
-@dataclass(frozen=True)
-class SparseAdjustment:
-    """A finished adjustment.
-
-    `parameters`: by the name of their family. `residuals` (whitened) and `redundancy`:
-    of each term. `cofactors`: of the local parameters of each member of the eliminated
-    and of the linked family, and of all common ones together. Without a solution
-    (`result`) cofactors and redundancies are NaN.
-    """
-
-    parameters: dict[str, Any]
-    residuals: list[Float[np.ndarray, "_ _"]]
-    redundancy: list[Float[np.ndarray, "_ _"]]
-    cofactors: dict[str, Float[np.ndarray, "_ _ _"]]
-    common_cofactor: Float[np.ndarray, "_ _"]
-    sigma0: float
-    degrees_of_freedom: int
-    pivot: float
-    iterations: int
-    result: RESULTS
 
 
 class Problem(NamedTuple):
@@ -123,6 +105,53 @@ class Minimum(NamedTuple):
     problem: Problem
     iterations: int
     result: RESULTS
+
+
+@dataclass(frozen=True)
+class SparseAdjustment:
+    """A finished adjustment.
+
+    `parameters`: by the name of their family. `residuals` (whitened) and `redundancy`:
+    of each term. `cofactors`: of the local parameters of each member of the eliminated
+    and of the linked family, and of all common ones together. `shifts`: of each term.
+    Without a solution (`result`) cofactors and redundancies are NaN, and there are no
+    shifts. `problem`: at the minimum.
+    """
+
+    parameters: dict[str, Any]
+    residuals: list[Float[np.ndarray, "_ _"]]
+    redundancy: list[Float[np.ndarray, "_ _"]]
+    shifts: list[Shifts]
+    cofactors: dict[str, Float[np.ndarray, "_ _ _"]]
+    common_cofactor: Float[np.ndarray, "_ _"]
+    sigma0: float
+    degrees_of_freedom: int
+    pivot: float
+    iterations: int
+    result: RESULTS
+    problem: Problem
+    datum: DatumOf | None
+
+    @cached_property
+    def all_cofactors(self) -> Cofactors:
+        """The cofactor matrix of all parameters, of which any columns can be had. The
+        normal equations are made and factorised once more. Raises `Singular`."""
+        problem = self.problem
+        system = _System(problem, self.datum)
+        factored, _, carried = system.factorise(_origin(problem), jnp.zeros(()))
+        return Cofactors(factored, carried, problem.data.pattern)
+
+    def rows(
+        self, members: Mapping[str, Sequence[int] | Int[np.ndarray, " _"]]
+    ) -> Int[np.ndarray, " row"]:
+        """Where the local parameters of members stand in `all_cofactors`, in the order
+        of the families and of their members."""
+        found = [np.zeros(0, int)]
+        for name, numbers in members.items():
+            begin, size = self.problem.roles.place(name)
+            member = np.asarray(numbers, int)[:, None]
+            found.append((begin + member * size + np.arange(size)[None]).ravel())
+        return np.concatenate(found)
 
 
 def adjust_sparse(
@@ -351,6 +380,7 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
         parameters=trimmed(data.families, members),
         residuals=rows,
         redundancy=[np.full_like(r, np.nan) for r in rows],
+        shifts=[],
         cofactors={
             roles.eliminated: unknown(roles.eliminated, roles.point_size),
             roles.linked: unknown(roles.linked, roles.block_size),
@@ -361,6 +391,8 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
         pivot=0.0,
         iterations=found.iterations,
         result=found.result,
+        problem=problem,
+        datum=datum,
     )
     try:
         factored, _, carried = system.factorise(steps, jnp.zeros(()))
@@ -371,19 +403,22 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
     q, crossed, corner = factored.select(problem.slots)
     room = np.zeros((roles.slots - len(q), *q.shape[1:]))
     options = {"data": data, "roles": roles}
-    of_slots = jax.device_put(np.concatenate([q, room]))
-    solved = carried, of_slots, *jax.device_put((crossed, corner))
-    of_points, redundancy = Program(read_solution, options, COMPILE_FAST)(solved)
+    cofactors = np.concatenate([q, room]), crossed, corner
+    solved = carried, Solved(*jax.device_put(cofactors))
+    every = Program(read_solution, options, COMPILE_FAST)(solved)
+    of_groups = lambda parts: [
+        jax.tree.map(lambda a, n=n: np.asarray(a)[:n], part)
+        for part, n in zip(parts, problem.groups, strict=True)
+    ]
     pivot = min(factored.pivot, float(np.min(carried.pivots)))
     singular = pivot < SINGULAR
     squares = sum(float(np.sum(r**2)) for r in rows)
     return replace(
         adjusted,
-        redundancy=[
-            np.asarray(a)[:n] for a, n in zip(redundancy, problem.groups, strict=True)
-        ],
+        redundancy=of_groups(every.redundancy),
+        shifts=of_groups(every.shifts),
         cofactors={
-            roles.eliminated: np.asarray(of_points)[: members[roles.eliminated]],
+            roles.eliminated: np.asarray(every.points)[: members[roles.eliminated]],
             roles.linked: q[: members[roles.linked]],
         },
         common_cofactor=corner,
@@ -401,7 +436,8 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
 
 def _origin(problem: Problem) -> Steps:
     """No displacement."""
-    return jax.device_put(origin(problem.data, problem.roles, np))
+    found = shapes(problem.data, problem.roles)
+    return jax.device_put({name: np.zeros(shape) for name, shape in found.items()})
 
 
 def _promise(data: tuple) -> DampedStep:

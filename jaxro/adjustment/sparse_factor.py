@@ -1,11 +1,12 @@
 """Which members of a family are linked, and the factorised matrix of their normal
-equations with everything that is read of it: solutions, and parts of the inverse.
+equations with everything that is read of it: solutions, parts of the inverse, and the
+products of the whole inverse by some columns.
 
 Everything here is NumPy on the host: it calls LAPACK, which compiled programs must not.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -63,6 +64,22 @@ class Reduced(NamedTuple):
     border: Float[jax.Array, "block d c"]
     common: Float[jax.Array, "c c"]
     b: Float[jax.Array, " c"]
+
+
+class Carried(NamedTuple):
+    """What leads from the reduced system back to the eliminated blocks: V⁻¹ with the
+    least pivot of each V, g, X, and W of each sighting; and of the whole system the
+    right-hand sides and the diagonals, of which the promise of a step is made."""
+
+    inverse: Float[jax.Array, "point p p"]
+    pivots: Float[jax.Array, " point"]
+    g: Float[jax.Array, "point p"]
+    x: Float[jax.Array, "point p c"]
+    w: Float[jax.Array, "sighting p d"]
+    right: tuple[Float[jax.Array, "block d"], Float[jax.Array, " c"]]
+    diagonals: tuple[
+        Float[jax.Array, "block d"], Float[jax.Array, " c"], Float[jax.Array, "point p"]
+    ]
 
 
 class Anchor(NamedTuple):
@@ -153,10 +170,12 @@ class Factored:
         right: Float[np.ndarray, "block d k"],
         common: Float[np.ndarray, "c k"],
     ) -> tuple[Float[np.ndarray, "block d k"], Float[np.ndarray, "c k"]]:
-        """The solution for some right-hand sides; of a free network one that moves the
-        datum by nothing."""
-        x, c = self._solve(right, common)
-        return (x, c) if self.free is None else self.free.move(x, c, to_rest=False)
+        """The cofactors times some right-hand sides; of a free network those of its
+        datum."""
+        if self.free is None:
+            return self._solve(right, common)
+        x, c = self._solve(*self.free.balance(right, common))
+        return self.free.move(x, c, to_rest=False)
 
     def step(
         self, right: Float[np.ndarray, "block d"], common: Float[np.ndarray, " c"]
@@ -236,6 +255,13 @@ class Free:
         moved = self.movements @ (self.held @ missing)
         return x + moved[: len(flat)].reshape(x.shape), c + moved[len(flat) :]
 
+    def balance(self, right, common):
+        """Pᵀ times right-hand sides: without what would move the network."""
+        flat = right.reshape(self.rows.shape[1], -1)
+        both = np.concatenate([flat, common])
+        less = self.rows.T @ (self.held.T @ (self.movements.T @ both))
+        return right - less.reshape(right.shape), common
+
     def correction(self, one, other):
         """P Q Pᵀ - Q between parameters, each given by their rows of G and of F."""
         (g, f), (g_other, f_other) = one, other
@@ -277,7 +303,10 @@ def factorise(
     flat = lambda x, c: np.concatenate([x.reshape(n * d, -1), c])
     movements = flat(*found.solve(right, none))
     spread = flat(*found.solve(np.moveaxis(datum.rows, 0, 2), none))
-    inverse = np.linalg.inv(datum.rows.reshape(k, -1) @ movements[: n * d])
+    try:
+        inverse = np.linalg.inv(datum.rows.reshape(k, -1) @ movements[: n * d])
+    except np.linalg.LinAlgError:
+        raise Singular from None
     found.free = Free(datum, movements, inverse, spread)
     return found
 
@@ -293,3 +322,55 @@ def _inverse(matrix: Float[np.ndarray, "c c"]) -> tuple[np.ndarray, float]:
         raise Singular from None
     half = np.linalg.inv(factor) / scale
     return half.T @ half, float(np.min(np.diagonal(factor)) ** 2)
+
+
+class Cofactors:
+    """The cofactor matrix Q of all parameters, (linked, common, eliminated) one after
+    the other, members of a family in their order. It is dense and never written down:
+    it is multiplied by columns, through the factor."""
+
+    def __init__(self, factored: Factored, carried: Carried, of: Pattern):
+        from scipy.sparse import coo_array
+
+        self._factored = factored
+        self._inverse, x, w = (
+            np.asarray(a) for a in (carried.inverse, carried.x, carried.w)
+        )
+        points, p, c = x.shape
+        self._shape = len(factored.levels.order), factored.size
+        self._x = x.reshape(points * p, c)
+        number = lambda member, size: member[:, None] * size + np.arange(size)[None]
+        rows = number(of.point, p)[:, :, None]
+        columns = number(of.block, factored.size)[:, None, :]
+        rows, columns = np.broadcast_arrays(rows, columns)
+        at = rows.ravel(), columns.ravel()
+        shape = points * p, self._shape[0] * self._shape[1]
+        self._w: Any = coo_array((w.ravel(), at), shape).tocsr()
+
+    @property
+    def number(self) -> int:
+        """Of all parameters."""
+        return sum(self._w.shape) + self._x.shape[1]
+
+    def times(self, right: Float[np.ndarray, "row k"]) -> Float[np.ndarray, "row k"]:
+        """Q times some columns; of a free network the Q of its datum."""
+        (n, d), k = self._shape, right.shape[1]
+        ends = n * d, n * d + self._x.shape[1]
+        linked, common, own = np.split(right, ends)
+        less = self._without(own)
+        h = linked - self._w.T @ less
+        x, c = self._factored.solve(h.reshape(n, d, k), common - self._x.T @ less)
+        x = x.reshape(n * d, k)
+        return np.concatenate([x, c, self._without(own - self._w @ x - self._x @ c)])
+
+    def between(self, rows: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
+        """Q of some parameters."""
+        unit = np.zeros((self.number, len(rows)))
+        unit[rows, np.arange(len(rows))] = 1.0
+        q = self.times(unit)[rows]
+        return (q + q.T) / 2
+
+    def _without(self, own):
+        """V⁻¹ times columns of the eliminated parameters."""
+        parts = own.reshape(*self._inverse.shape[:2], -1)
+        return (self._inverse @ parts).reshape(own.shape)

@@ -1,6 +1,7 @@
 """Normal equations of thousands of blocks, and what follows from their solution: the
 compiled programs of `sparse`, whose docstring has the equations."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .blocks import Linearised, Steps, linearise, residuals
 from .elimination import inverses
-from .sparse_factor import Pattern, Reduced
+from .sparse_factor import Carried, Pattern, Reduced
 from .terms import Term
 
 
@@ -37,6 +38,17 @@ class Roles(NamedTuple):
         size = self.common_sizes[k]
         return self.begin[k] + member[:, None] * size + jnp.arange(size)[None]
 
+    def place(self, name: str) -> tuple[int, int]:
+        """Where the parameters of a family begin among all of them (linked, common,
+        eliminated), and how many each member has."""
+        linked = self.blocks * self.block_size
+        if name == self.linked:
+            return 0, self.block_size
+        if name == self.eliminated:
+            return linked + self.common_total, self.point_size
+        k = self.common.index(name)
+        return linked + self.begin[k], self.common_sizes[k]
+
 
 class Data(NamedTuple):
     """The terms, the families that they displace, and who meets whom."""
@@ -44,22 +56,6 @@ class Data(NamedTuple):
     terms: tuple[Term, ...]
     families: dict[str, Any]
     pattern: Pattern
-
-
-class Carried(NamedTuple):
-    """What leads from the reduced system back to the eliminated blocks: V⁻¹ with the
-    least pivot of each V, g, X, and W of each sighting; and of the whole system the
-    right-hand sides and the diagonals, of which the promise of a step is made."""
-
-    inverse: Float[Array, "point p p"]
-    pivots: Float[Array, " point"]
-    g: Float[Array, "point p"]
-    x: Float[Array, "point p c"]
-    w: Float[Array, "sighting p d"]
-    right: tuple[Float[Array, "block d"], Float[Array, " c"]]
-    diagonals: tuple[
-        Float[Array, "block d"], Float[Array, " c"], Float[Array, "point p"]
-    ]
 
 
 class Touched(NamedTuple):
@@ -72,11 +68,54 @@ class Touched(NamedTuple):
     residuals: Float[Array, "group m"]
 
 
+class Normals(NamedTuple):
+    """The normal equations before the elimination, W sighting by sighting."""
+
+    s: Float[Array, "slot d d"]
+    h: Float[Array, "block d"]
+    border: Float[Array, "block d c"]
+    common: Float[Array, "c c"]
+    b: Float[Array, " c"]
+    v: Float[Array, "point p p"]
+    g: Float[Array, "point p"]
+    x: Float[Array, "point p c"]
+    w: Float[Array, "sighting p d"]
+
+
+class Solved(NamedTuple):
+    """Cofactors that the elimination reaches: of linked blocks by slots, of each of
+    them with the common parameters, and of these."""
+
+    links: Float[Array, "slot d d"]
+    crossed: Float[Array, "block d c"]
+    common: Float[Array, "c c"]
+
+
+class OfPoints(NamedTuple):
+    """Cofactors of each point, with the block of each sighting, and with the common
+    parameters."""
+
+    own: Float[Array, "point p p"]
+    links: Float[Array, "sighting p d"]
+    common: Float[Array, "point p c"]
+
+
+class Shifts(NamedTuple):
+    """N⁻¹ Aᵀ of the rows of a term, as far as these touch what is shifted: the linked
+    blocks in their order, and the eliminated one (if any). By it a member moves back
+    where a whitened residual grows by 1."""
+
+    links: list[Float[Array, "group d m"]]
+    own: Float[Array, "group p m"] | None
+
+
 class Read(NamedTuple):
-    """Cofactors of each point, and the redundancy of each row of each term."""
+    """Cofactors of each point; the redundancy of each row and the `Shifts` of each
+    term."""
 
     points: Float[Array, "point p p"]
     redundancy: list[Float[Array, "_ _"]]
+    shifts: list[Shifts]
 
 
 def all_residuals(steps: Steps, data: Data) -> list[Float[Array, "_ _"]]:
@@ -90,63 +129,93 @@ def reduce_normals(
     """The normal equations of displaced families, their diagonal larger by the part
     `damping`, after the elimination."""
     steps, damping = at
-    n, d, c = roles.blocks, roles.block_size, roles.common_total
-    e, p = roles.points, roles.point_size
-    of = data.pattern
-    blocks = jnp.zeros((roles.slots, d, d))
-    h, border = jnp.zeros((n, d)), jnp.zeros((n, d, c))
-    common, b = jnp.zeros((c, c)), jnp.zeros(c)
-    v, g, x = jnp.zeros((e, p, p)), jnp.zeros((e, p)), jnp.zeros((e, p, c))
-    w, direct = [], list(of.direct)
-    for touched in _all_touched(data, steps, roles):
-        r, cross = touched.residuals, touched.common
-        common = common + jnp.einsum("gmi,gmj->ij", cross, cross)
-        b = b + jnp.einsum("gmi,gm->i", cross, r)
-        for i, a in touched.links:
-            blocks = blocks.at[i].add(_product(a, a))
-            h = h + segment_sum(jnp.sum(a * r[:, :, None], 1), i, n)
-            border = border + segment_sum(_product(a, cross), i, n)
-        for (i, a), (j, other) in _meeting(touched.links):
-            slot = direct.pop(0)
-            both = _product(a, other)
-            turned = jnp.where((i >= j)[:, None, None], both, jnp.swapaxes(both, 1, 2))
-            # a block that meets itself has both halves of the product
-            same = (i == j)[:, None, None]
-            turned = turned + jnp.where(same, jnp.swapaxes(both, 1, 2), 0.0)
-            blocks = blocks.at[slot].add(turned)
-        if touched.own is None:
-            continue
-        i, a = touched.own
-        v = v + segment_sum(_product(a, a), i, e)
-        g = g + segment_sum(jnp.sum(a * r[:, :, None], 1), i, e)
-        x = x + segment_sum(_product(a, cross), i, e)
-        w += [_product(a, other) for _, other in touched.links]
-    right = h, b
+    n, of, whole = roles.blocks, data.pattern, _normals(data, steps, roles)
     diagonal = lambda a: jnp.diagonal(a, axis1=-2, axis2=-1)
-    diagonals = diagonal(blocks[:n]), diagonal(common), diagonal(v)
-    blocks = blocks.at[:n].add(_diagonal(_more(diagonals[0], damping)))
-    common = common + jnp.diag(damping * diagonals[1])
-    inverse, pivots = inverses(v + _diagonal(_more(diagonals[2], damping)))
-    w = jnp.concatenate(w)
-    k = _times(inverse[of.point], w)
+    diagonals = tuple(map(diagonal, (whole.s[:n], whole.common, whole.v)))
+    more = [_diagonal(_more(a, damping)) for a in (diagonals[0], diagonals[2])]
+    inverse, pivots = inverses(whole.v + more[1])
+    w, x, g = whole.w, whole.x, whole.g
+    of_w, of_x = _times(inverse[of.point], w), _times(inverse, x)
+    along_w = jnp.sum(of_w * g[of.point][:, :, None], 1)
+    common = whole.common + jnp.diag(damping * diagonals[1])
+    reduced = Reduced(
+        blocks=_without_points(whole.s.at[:n].add(more[0]), of, w, of_w),
+        h=whole.h - segment_sum(along_w, of.block, n),
+        border=whole.border - segment_sum(_product(w, of_x[of.point]), of.block, n),
+        common=common - jnp.einsum("epi,epj->ij", x, of_x),
+        b=whole.b - jnp.einsum("epi,ep->i", of_x, g),
+    )
     carried = Carried(
         inverse=inverse,
         pivots=pivots,
         g=g,
         x=x,
         w=w,
-        right=right,
+        right=(whole.h, whole.b),
         diagonals=diagonals,
     )
-    of_x = _times(inverse, x)
-    reduced = Reduced(
-        blocks=_without_points(blocks, of, w, k),
-        h=h - segment_sum(jnp.sum(k * g[of.point][:, :, None], 1), of.block, n),
-        border=border - segment_sum(_product(w, of_x[of.point]), of.block, n),
-        common=common - jnp.einsum("epi,epj->ij", x, of_x),
-        b=b - jnp.einsum("epi,ep->i", of_x, g),
-    )
     return reduced, carried
+
+
+def _normals(data: Data, steps: Steps, roles: Roles) -> Normals:
+    """The sums over all terms."""
+    n, d, c = roles.blocks, roles.block_size, roles.common_total
+    e, p = roles.points, roles.point_size
+    sums = Normals(
+        s=jnp.zeros((roles.slots, d, d)),
+        h=jnp.zeros((n, d)),
+        border=jnp.zeros((n, d, c)),
+        common=jnp.zeros((c, c)),
+        b=jnp.zeros(c),
+        v=jnp.zeros((e, p, p)),
+        g=jnp.zeros((e, p)),
+        x=jnp.zeros((e, p, c)),
+        w=jnp.zeros((0, p, d)),
+    )
+    direct = iter(data.pattern.direct)
+    for touched in _all_touched(data, steps, roles):
+        sums = _add_own(
+            _add_common(_add_links(sums, touched, direct), touched), touched
+        )
+    return sums
+
+
+def _add_links(sums: Normals, touched: Touched, direct: Iterator) -> Normals:
+    """With the products of the linked columns; `direct`: the slots of two of them."""
+    s, h, border, n = sums.s, sums.h, sums.border, len(sums.h)
+    for i, a in touched.links:
+        s = s.at[i].add(_product(a, a))
+        h = h + segment_sum(_along(a, touched.residuals), i, n)
+        border = border + segment_sum(_product(a, touched.common), i, n)
+    for (i, a), (j, b) in _meeting(touched.links):
+        both = _product(a, b)
+        turned = jnp.where((i >= j)[:, None, None], both, _turned(both))
+        # a block that meets itself has both halves of the product
+        turned = turned + jnp.where((i == j)[:, None, None], _turned(both), 0.0)
+        s = s.at[next(direct)].add(turned)
+    return sums._replace(s=s, h=h, border=border)
+
+
+def _add_common(sums: Normals, touched: Touched) -> Normals:
+    """With the products of the common columns."""
+    a = touched.common
+    return sums._replace(
+        common=sums.common + jnp.einsum("gmi,gmj->ij", a, a),
+        b=sums.b + jnp.einsum("gmi,gm->i", a, touched.residuals),
+    )
+
+
+def _add_own(sums: Normals, touched: Touched) -> Normals:
+    """With the products of the eliminated columns."""
+    if touched.own is None:
+        return sums
+    (i, a), e = touched.own, len(sums.v)
+    return sums._replace(
+        v=sums.v + segment_sum(_product(a, a), i, e),
+        g=sums.g + segment_sum(_along(a, touched.residuals), i, e),
+        x=sums.x + segment_sum(_product(a, touched.common), i, e),
+        w=jnp.concatenate([sums.w, *(_product(a, b) for _, b in touched.links)]),
+    )
 
 
 def _without_points(
@@ -183,75 +252,106 @@ def carry_back(
     return y, total(along), total(spread)
 
 
-def read_solution(
-    solved: tuple[
-        Carried,
-        Float[Array, "slot d d"],
-        Float[Array, "block d c"],
-        Float[Array, "c c"],
-    ],
-    data: Data,
-    roles: Roles,
-) -> Read:
-    """Cofactors of the points and redundancies of all rows, from the cofactors of the
-    linked and common parameters."""
-    carried, q, crossed, corner = solved
-    of, inverse, x, w = data.pattern, carried.inverse, carried.x, carried.w
-    # of point and linked block of each sighting, times -V
-    seen = _times(x[of.point], jnp.swapaxes(crossed, 1, 2)[of.block])
+def read_solution(solved: tuple[Carried, Solved], data: Data, roles: Roles) -> Read:
+    """What follows from the cofactors of the linked and common parameters."""
+    carried, known = solved
+    points = _of_points(carried, known, data.pattern)
+    redundancy, shifts = [], []
+    direct, begin = iter(data.pattern.direct), 0
+    every = zip(_all_touched(data, origin(data, roles), roles), data.terms, strict=True)
+    for touched, term in every:
+        groups = len(term.mask)
+        end = begin + groups * len(touched.links) * (touched.own is not None)
+        sightings = points.links[begin:end].reshape(-1, groups, *points.links.shape[1:])
+        begin = end
+        shift, common = _shift(touched, known, points, sightings, direct)
+        taken = _taken(touched.common, common)
+        for (_, a), b in zip(touched.links, shift.links, strict=True):
+            taken = taken + _taken(a, b)
+        if touched.own is not None and shift.own is not None:
+            taken = taken + _taken(touched.own[1], shift.own)
+        redundancy.append(jnp.where(term.mask[:, None], 1 - taken, 0.0))
+        shifts.append(shift)
+    return Read(points.own, redundancy, shifts)
+
+
+def _of_points(carried: Carried, known: Solved, of: Pattern) -> OfPoints:
+    """Q_yx = -V⁻¹ (W Q_xx + X Q_cx), and so on, for the points."""
+    inverse, x, w = carried.inverse, carried.x, carried.w
+    sum_ = lambda a: segment_sum(a, of.point, len(inverse))
+    # with the block of each sighting, times -V
+    seen = _times(x[of.point], _turned(known.crossed)[of.block])
 
     def more(seen, chunk):
         one, other, slot, both = chunk
-        own = q.at[slot].get(mode="fill", fill_value=0.0)
+        own = known.links.at[slot].get(mode="fill", fill_value=0.0)
         seen = seen.at[other].add(_times(w[one], own))
-        turned = jnp.where(both[:, None, None], jnp.swapaxes(own, 1, 2), 0.0)
+        turned = jnp.where(both[:, None, None], _turned(own), 0.0)
         return seen.at[one].add(_times(w[other], turned)), None
 
     seen = jax.lax.scan(more, seen, (of.p, of.q, of.slot, of.both))[0]
-    # of point and common parameters, times -V
-    sums = segment_sum(_times(w, crossed[of.block]), of.point, roles.points)
-    with_common = sums + _times(x, corner[None])
-    turned = lambda a: jnp.swapaxes(a, 1, 2)
-    middle = segment_sum(_times(seen, turned(w)), of.point, roles.points)
-    middle = middle + _times(with_common, turned(x))
-    points = inverse + _times(_times(inverse, middle), inverse)
-    with_links = -_times(inverse[of.point], seen)
-    with_common = -_times(inverse, with_common)
-
-    steps = origin(data, roles)
-    redundancy, begin, direct = [], 0, list(of.direct)
-    taken_by = lambda a, q, b: jnp.sum(_times(a, q) * b, axis=2)
-    every = zip(_all_touched(data, steps, roles), data.terms, strict=True)
-    for touched, term in every:
-        cross = touched.common
-        taken = taken_by(cross, corner[None], cross)
-        for i, a in touched.links:
-            taken = taken + taken_by(a, q[i], a)
-            taken = taken + 2 * taken_by(a, crossed[i], cross)
-        for (i, a), (j, b) in _meeting(touched.links):
-            own = q[direct.pop(0)]
-            own = jnp.where((i >= j)[:, None, None], own, turned(own))
-            taken = taken + 2 * taken_by(a, own, b)
-        if touched.own is not None:
-            e, a = touched.own
-            taken = taken + taken_by(a, points[e], a)
-            taken = taken + 2 * taken_by(a, with_common[e], cross)
-            for _, b in touched.links:
-                own = with_links[begin : begin + len(e)]
-                taken = taken + 2 * taken_by(a, own, b)
-                begin += len(e)
-        redundancy.append(jnp.where(term.mask[:, None], 1 - taken, 0.0))
-    return Read(points, redundancy)
+    # with the common parameters, times -V
+    common = sum_(_times(w, known.crossed[of.block])) + _times(x, known.common[None])
+    middle = sum_(_times(seen, _turned(w))) + _times(common, _turned(x))
+    return OfPoints(
+        own=inverse + _times(_times(inverse, middle), inverse),
+        links=-_times(inverse[of.point], seen),
+        common=-_times(inverse, common),
+    )
 
 
-def origin(data: Data, roles: Roles, xp: Any = jnp) -> Steps:
-    """No displacement; `xp`: the library of its arrays. NumPy compiles nothing for
-    every number of members."""
+def _shift(
+    touched: Touched,
+    known: Solved,
+    points: OfPoints,
+    sightings: Float[Array, "link group p d"],
+    direct: Iterator,
+) -> tuple[Shifts, Float[Array, "group c m"]]:
+    """The `Shifts` of one term, and those of the common parameters. `sightings`: the
+    cofactors of its points with its linked blocks; `direct`: the slots of two of
+    these."""
+    across = _turned(touched.common)
+    common = _times(known.common[None], across)
+    links = []
+    for i, a in touched.links:
+        links.append(_times(known.links[i], _turned(a)))
+        links[-1] = links[-1] + _times(known.crossed[i], across)
+        common = common + _times(_turned(known.crossed)[i], _turned(a))
+    numbered = list(enumerate(touched.links))
+    for (first, (i, a)), (second, (j, b)) in _meeting(numbered):
+        q = known.links[next(direct)]
+        q = jnp.where((i >= j)[:, None, None], q, _turned(q))
+        links[first] = links[first] + _times(q, _turned(b))
+        links[second] = links[second] + _times(_turned(q), _turned(a))
+    if touched.own is None:
+        return Shifts(links, None), common
+    e, a = touched.own
+    own = _times(points.own[e], _turned(a)) + _times(points.common[e], across)
+    common = common + _times(_turned(points.common)[e], _turned(a))
+    for k, (_, b) in numbered:
+        own = own + _times(sightings[k], _turned(b))
+        links[k] = links[k] + _times(_turned(sightings[k]), _turned(a))
+    return Shifts(links, own), common
+
+
+def _taken(
+    a: Float[Array, "group m k"], shift: Float[Array, "group k m"]
+) -> Float[Array, "group m"]:
+    """The part of each row that some parameters take: the diagonal of a shift."""
+    return jnp.sum(a * _turned(shift), axis=2)
+
+
+def origin(data: Data, roles: Roles) -> Steps:
+    """No displacement."""
+    return {name: jnp.zeros(shape) for name, shape in shapes(data, roles).items()}
+
+
+def shapes(data: Data, roles: Roles) -> dict[str, tuple[int, int]]:
+    """Of the displacements of each family."""
     sizes = dict(zip(roles.common, roles.common_sizes, strict=True))
     sizes |= {roles.eliminated: roles.point_size, roles.linked: roles.block_size}
     number = lambda name: jax.tree.leaves(data.families[name])[0].shape[0]
-    zeros = lambda name: xp.zeros((number(name), sizes[name]))
-    return {name: zeros(name) for name in data.families}
+    return {name: (number(name), sizes[name]) for name in data.families}
 
 
 def _all_touched(data: Data, steps: Steps, roles: Roles) -> list[Touched]:
@@ -295,6 +395,16 @@ def _more(
 def _diagonal(entries: Float[Array, "member k"]) -> Float[Array, "member k k"]:
     """Diagonal matrices."""
     return entries[:, :, None] * jnp.eye(entries.shape[1])[None]
+
+
+def _turned(a: Float[Array, "g i j"]) -> Float[Array, "g j i"]:
+    """Each matrix transposed."""
+    return jnp.swapaxes(a, 1, 2)
+
+
+def _along(a: Float[Array, "g m i"], r: Float[Array, "g m"]) -> Float[Array, "g i"]:
+    """aᵀ r of each group."""
+    return jnp.sum(a * r[:, :, None], axis=1)
 
 
 def _product(a: Float[Array, "g m i"], b: Float[Array, "g m j"]):

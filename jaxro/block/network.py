@@ -144,6 +144,15 @@ def in_order(
     return tuple(part for part in parts if len(part.row))
 
 
+def points_of(parts: tuple[KnownCoordinates, ...]) -> KnownCoordinates:
+    """The known coordinates of points alone."""
+    some = [part for part in parts if not part.station[0]]
+    none = np.zeros(0, int), np.zeros(0), np.zeros(0, bool)
+    whole, real, truth = none
+    empty = KnownCoordinates(whole, whole, whole, real, real, truth)
+    return some[0] if some else empty
+
+
 def spread_known(
     parts: tuple[KnownCoordinates, ...],
     values: Sequence[np.ndarray],
