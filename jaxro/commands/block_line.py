@@ -73,6 +73,22 @@ Components = Annotated[
         "their residuals tell them (variance components).",
     ),
 ]
+Conditions = Annotated[
+    bool,
+    typer.Option(
+        "--conditions",
+        help="Adjust a small block by the conditions of the 1982 fragment as well, and "
+        "tell how far both solutions are apart.",
+    ),
+]
+Classical = Annotated[
+    bool,
+    typer.Option(
+        "--classical",
+        help="Show beside it what the classical adjustment of independent models claims, "
+        "and how accurate it truly is.",
+    ),
+]
 Level = Annotated[
     float,
     typer.Option(
@@ -153,6 +169,8 @@ def block(
     sigma: Sigma = None,
     inner: InnerNames = None,
     components: Components = False,
+    conditions: Conditions = False,
+    classical: Classical = False,
     level: Level = 0.05,
     unit: Unit = "m",
     photo_unit: PhotoUnit = "mm",
@@ -193,6 +211,8 @@ def block(
         bars=bars,
         inner=inner,
         components=components,
+        conditions=conditions,
+        classical=classical,
         level=level,
         unit=unit,
         parquet=parquet or (file is not None and is_parquet(file)),

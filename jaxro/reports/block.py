@@ -157,8 +157,27 @@ def _accuracy(done: Done) -> str:
     return (
         f"Accuracy: standard deviations of the points X {rms[0]}, Y {rms[1]}, Z "
         f"{rms[2]} {done.unit} (root mean square), the weakest of {name} with "
-        f"{number(most, digits(most, 1))}"
+        f"{number(most, digits(most, 1))}{_hidden(done)}"
     )
+
+
+def _hidden(done: Done) -> str:
+    """What errors that no test finds would do."""
+    checked = done.reliability.rays
+    used = np.isfinite(checked.redundancy)
+    largest = np.where(np.isfinite(checked.largest), checked.largest, -1.0)
+    k = int(np.argmax(largest))
+    text = ""
+    if largest[k] > 0:
+        block = done.adjusted.block
+        name = block.points[block.point[k]]
+        text = (
+            "\nAn error of a place that is found in 80 % of cases moves its point by up "
+            f"to {number(largest[k], digits(largest[k], 1))} {done.unit} ({name})"
+        )
+    if number_unchecked := int(np.sum(checked.unchecked & used)):
+        text += f"; {number_unchecked} coordinates of places are checked by nothing"
+    return text
 
 
 # -------------------------------------------------------------------------------------

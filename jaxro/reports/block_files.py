@@ -167,6 +167,11 @@ def _control(done: Done) -> Columns:
     return table | {"left_out": np.any(left_out & known, axis=1).tolist()}
 
 
+def _finite(values: np.ndarray) -> np.ndarray:
+    """The numbers, NaN where nothing checks a coordinate."""
+    return np.where(np.isfinite(values), values, np.nan)
+
+
 def _role(name: str, role: str) -> str:
     return "station" if name.startswith(STATION_OF) else role
 
@@ -186,6 +191,9 @@ def _residuals(done: Done) -> Columns:
     table |= _with_names("xy", adjusted.misfits, "v")
     table |= _with_names("xy", adjusted.redundancy, "redundancy_")
     table |= _with_names("xy", done.tested.rays, "w_")
+    checked = done.reliability.rays
+    table |= _with_names("xy", _finite(checked.detectable), "detectable_")
+    table |= {"effect": _finite(checked.largest)}
     return table | {"left_out": done.oriented.wrong.rays.tolist()}
 
 

@@ -12,6 +12,7 @@ from ..adjustment import RESULTS, critical_values as critical
 from ..block.adjust import BlockAdjustment
 from ..block.measured_block import Ground
 from ..block.orient_block import OrientedBlock
+from ..block.reliability import BlockReliability, assess_block
 from ..block.wrong import UNCHECKED, Tested, normalise_residuals
 from .control import LEVEL, Compared
 
@@ -66,6 +67,11 @@ class Done:
     def tested(self) -> Tested:
         """The normalised residuals."""
         return normalise_residuals(self.adjusted, LEVEL)
+
+    @cached_property
+    def reliability(self) -> BlockReliability:
+        """Which errors the tests find with a probability of 80 %."""
+        return assess_block(self.adjusted, level=LEVEL, familywise=True)
 
     @property
     def chance(self) -> float:

@@ -179,6 +179,24 @@ def test_stations_inner_parameters_and_components(tables, tmp_path):
     assert set(summary["components"]) == {"places", "control", "stations"}
 
 
+def test_other_ways_are_told_beside_it(tables):
+    """By conditions the solution is the same; classical models are less accurate."""
+    told = block(tables, "--conditions", "--classical")
+    assert told.exit_code == 0, told.output
+    text = words(told.stdout)
+    apart = text.split("largest difference of a residual ")[1].split(" ")[0]
+    assert float(apart) < 1e-9
+    lines = [
+        line.split() for line in told.stdout.splitlines() if "centres tied" in line
+    ]
+    assert len(lines) == 2
+    for line in lines:
+        plan, height = map(float, line[-6:-4])
+        assert 1 < plan < 2 and 1 < height < 2
+    refused = block(tables, "--conditions", "--inner", "focal")
+    assert refused.exit_code == 2 and "--conditions" in refused.stderr
+
+
 def test_scale_bars_without_control(tables, tmp_path):
     ground = {row["point"]: row for row in rows(tables[1])}
     at = {name: numbers([row], *AXES)[0] for name, row in ground.items()}
