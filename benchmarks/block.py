@@ -55,7 +55,7 @@ def adjusted(strips: int, models: int, goal: float, most: float) -> list[Metric]
     wrong = (found.coordinates - mock.points) / deviations
     demand(abs(np.nanmean(wrong**2) - 1), 0.6, "errors of points and their deviations")
     used = memory() - before
-    key = f"block of {strips} x {models} models"
+    key = f"block, {strips} x {models} models"
     return [
         seconds(f"{key}: first call", first, goal=goal),
         seconds(f"{key}: later calls", later),
@@ -76,12 +76,12 @@ def grown(turns: int) -> list[Metric]:
         call()
         times.append(np.median([walled(call)[0] for _ in range(turns)]) / models)
     of = lambda models, factor: Metric(
-        f"block, a model of a strip of {models}", factor, "times", "lower", goal=1.5
+        f"block, a model of a strip: {models}", factor, "times", "lower", goal=1.5
     )
     few, some, many = times
     return [
-        of("1,000 against one of 100", some / few),
-        of("10,000 against one of 1,000", many / some),
+        of("of 1,000 against one of 100", some / few),
+        of("of 10,000 against one of 1,000", many / some),
     ]
 
 
@@ -103,7 +103,7 @@ def beside_pycolmap(images: int, points: int, turns: int) -> list[Metric]:
         both = (np.trace(q, axis1=1, axis2=2) for q in (found[1], rotations))
         demand(np.max(np.abs(np.divide(*both) - 1)), 1e-3, "covariances and pycolmap's")
     ours, peer = np.median(times, axis=0)
-    key = f"block of {images} images, {points:,} points"
+    key = f"block, {images} images of {points:,} points"
     return [ratio(f"{key}: against pycolmap", peer, ours, None)]
 
 
