@@ -35,6 +35,7 @@ from .network import (
     KnownCoordinates,
     Numbered,
     Start,
+    complete,
     frame_of,
     in_order,
     known_of,
@@ -334,6 +335,7 @@ def prepare_block(
     points, of_points = start.points.copy(), known.take(~known.station)
     at = of_points.number, of_points.axis
     points[at] = np.where(np.isnan(points[at]), of_points.value, points[at])
+    points = complete(block, start, points)
     there = np.all(np.isfinite(points), axis=1)
     number = known.of_points(len(block.points))
     numbered = number_points(block, number, use & there[block.point])

@@ -134,6 +134,31 @@ def known_of(block: MeasuredBlock, ground: Ground) -> KnownCoordinates:
     return KnownCoordinates(row, number[row], axis, *values, ground.station[row])
 
 
+def complete(
+    block: MeasuredBlock, start: Start, points: Float[np.ndarray, "point 3"]
+) -> Float[np.ndarray, "point 3"]:
+    """The points, those with one unknown coordinate (NaN) where one of their rays passes
+    by the two others."""
+    from scipy.spatial.transform import Rotation
+
+    numbers, rays = np.unique(block.point, return_index=True)
+    open_ = np.sum(np.isnan(points[numbers]), axis=1) == 1
+    if not np.any(open_):
+        return points
+    point, ray = numbers[open_], rays[open_]
+    photo = block.photo[ray]
+    x, y = places_of(block)[ray].T
+    turn = Rotation.from_quat(start.quaternions[photo][:, [1, 2, 3, 0]])
+    along = turn.inv().apply(np.stack([x, y, np.ones(len(x))], axis=1))
+    away = points[point] - start.centres[photo]
+    squares = np.sum(np.where(np.isnan(away), 0.0, along**2), axis=1)
+    distance = np.nansum(away * along, axis=1) / squares
+    found = start.centres[photo] + distance[:, None] * along
+    points = points.copy()
+    points[point] = np.where(np.isnan(points[point]), found, points[point])
+    return points
+
+
 def in_order(
     known: KnownCoordinates, numbered: Numbered
 ) -> tuple[KnownCoordinates, ...]:

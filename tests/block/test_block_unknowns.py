@@ -178,3 +178,30 @@ def test_bars_give_a_free_network_its_scale():
     with pytest.raises(ValueError, match="no bar has both"):
         strange = given._replace(one=("a", "b", "c"))
         adjust_block(found.block, found.as_start, bars=strange)
+
+
+@pytest.mark.parametrize("unknown", [2, 0])
+def test_two_coordinates_of_a_point_on_one_photo_determine_it(unknown):
+    """It begins on its ray; its other two coordinates check the photo by one."""
+    mock = block.mock_block(9, Flight(models=3))
+    name = mock.block.points[20]
+    rays = np.flatnonzero(mock.block.point == 20)
+    alone = np.zeros(len(mock.block.photo), bool)
+    alone[rays[1:]] = True
+    measured = mock.block.without(alone)
+    at = np.array([mock.points[20]])
+    at[0, unknown] = np.nan
+    known = mock.ground._replace(
+        points=(*mock.ground.points, name),
+        coordinates=np.concatenate([mock.ground.coordinates, at]),
+        sigma=np.concatenate([mock.ground.sigma, np.full((1, 3), 0.02)]),
+        check=np.append(mock.ground.check, False),
+        station=np.append(mock.ground.station, False),
+    )
+    start = start_from(measured, mock.photos)
+    assert np.all(np.isnan(start.points[20]))
+    found = adjust_block(measured, start, known).check()
+    without = adjust_block(measured, start, mock.ground).check()
+    assert found.degrees_of_freedom == without.degrees_of_freedom + 1
+    off = (found.coordinates[20] - mock.points[20]) / found.deviations[20]
+    assert np.max(np.abs(off)) < 4
