@@ -28,7 +28,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .block_tridiagonal import Levels, arrange
-from .blocks import Families, Steps, move, normalise
+from .blocks import Families, Steps
 from .elimination import layout
 from .levenberg_marquardt import DampedStep, LevenbergMarquardt, promised
 from .normal_equations import SINGULAR
@@ -52,6 +52,7 @@ from .sparse_normals import (
     Solved,
     all_residuals,
     carry_back,
+    displace,
     read_solution,
     reduce_normals,
     shapes,
@@ -340,11 +341,7 @@ def minimise(
     system = _System(problem, datum)
     solver = LevenbergMarquardt(rtol=SHORT, damping=FIRST_DAMPING)
     function = lambda steps, system: (system(steps), None)
-    steps, done, result = (
-        _origin(problem),
-        False,
-        RESULTS.diverged,
-    )
+    steps, done, result = _origin(problem), False, RESULTS.diverged
     state = solver.init(function, steps, system, {}, None, None, frozenset())
     number = 0
     while number < max_steps and not done:
@@ -458,11 +455,4 @@ def trimmed(families: dict[str, Any], members: dict[str, int]) -> dict[str, Any]
 
 def displaced(data: Data, steps: Steps) -> dict[str, Any]:
     """The families after a displacement, in their standard form."""
-    return Program(_displaced, {}, COMPILE_FAST)((data.families, steps))
-
-
-def _displaced(data: tuple[dict[str, Any], Steps]) -> dict[str, Any]:
-    families, steps = data
-    return {
-        name: normalise(move(family, steps[name])) for name, family in families.items()
-    }
+    return Program(displace, {}, COMPILE_FAST)((data.families, steps))

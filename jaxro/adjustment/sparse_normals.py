@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.ops import segment_sum
 from jaxtyping import Array, Float, Int
 
-from .blocks import Linearised, Steps, linearise, residuals
+from .blocks import Linearised, Steps, linearise, move, normalise, residuals
 from .elimination import inverses
 from .sparse_factor import Carried, Pattern, Reduced
 from .terms import Term
@@ -116,6 +116,14 @@ class Read(NamedTuple):
     points: Float[Array, "point p p"]
     redundancy: list[Float[Array, "_ _"]]
     shifts: list[Shifts]
+
+
+def displace(data: tuple[dict[str, Any], Steps]) -> dict[str, Any]:
+    """The families after a displacement, in their standard form."""
+    families, steps = data
+    return {
+        name: normalise(move(family, steps[name])) for name, family in families.items()
+    }
 
 
 def all_residuals(steps: Steps, data: Data) -> list[Float[Array, "_ _"]]:

@@ -23,7 +23,6 @@ from ..adjustment.sparse import (
     with_room,
 )
 from ..calibration.camera import Station
-from ..geometry import rotations as rot
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .bars import Bars, NoBar, bar_terms
@@ -35,6 +34,7 @@ from .network import (
     KnownCoordinates,
     Numbered,
     Start,
+    angles_and_centre,
     complete,
     frame_of,
     in_order,
@@ -409,11 +409,7 @@ def _angles(
 
     def of_photo(station: Station, q: Array) -> tuple[Array, Array]:
         def values(step: Array) -> Array:
-            moved = station.move(step).normalise()
-            turn = rot.from_quaternion(*(moved.quaternion[k] for k in range(4)))
-            # from y down and z forward to y up and z backward
-            m = turn[0], rot.scale(turn[1], -1.0), rot.scale(turn[2], -1.0)
-            return jnp.concatenate([jnp.stack(rot.omega_phi_kappa(m)), moved.centre])
+            return angles_and_centre(station.move(step))
 
         origin = jnp.zeros(6)
         j = jax.jacfwd(values)(origin)

@@ -22,6 +22,7 @@ from ..geometry import rotations as rot
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
 from .adjust import BlockAdjustment
+from .network import angles_and_centre, photo_axes
 
 
 class Asked(NamedTuple):
@@ -148,19 +149,6 @@ def _find(
         if name not in numbers:
             raise ValueError(f"the block has no {kind} {name!r}")
     return np.array([numbers[name] for name in names], int)
-
-
-def angles_and_centre(station: Station) -> Float[Array, "6"]:
-    """omega, phi, kappa and the centre of one photo."""
-    turn = rot.omega_phi_kappa(photo_axes(station))
-    return jnp.concatenate([jnp.stack(turn), station.centre])
-
-
-def photo_axes(station: Station) -> rot.Matrix:
-    """M of one photo, object to photo (y up, z backward)."""
-    quaternion = rot.unit_quaternion(station.quaternion)
-    turn = rot.from_quaternion(*(quaternion[k] for k in range(4)))
-    return turn[0], rot.scale(turn[1], -1.0), rot.scale(turn[2], -1.0)
 
 
 def _slopes(stations: Station) -> Float[Array, "photo 6 6"]:

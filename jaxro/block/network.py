@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment import Term
 from ..calibration.camera import Camera, Measured, Station, misfit, perspective
+from ..geometry import rotations as rot
 from .inner import Inner, OfRay, cameras_of
 from .measured_block import Ground, MeasuredBlock
 
@@ -64,6 +65,19 @@ def of_coordinate(point: Float[Array, "3"], known: tuple[Array, Array]):
 def of_station(station: Station, known: tuple[Array, Array]):
     """The misfit of one known coordinate of a projection centre."""
     return of_coordinate(station.centre, known)
+
+
+def angles_and_centre(station: Station) -> Float[Array, "6"]:
+    """omega, phi, kappa and the centre of one photo."""
+    turn = rot.omega_phi_kappa(photo_axes(station))
+    return jnp.concatenate([jnp.stack(turn), station.centre])
+
+
+def photo_axes(station: Station) -> rot.Matrix:
+    """M of one photo, object to photo (y up, z backward)."""
+    quaternion = rot.unit_quaternion(station.quaternion)
+    turn = rot.from_quaternion(*(quaternion[k] for k in range(4)))
+    return turn[0], rot.scale(turn[1], -1.0), rot.scale(turn[2], -1.0)
 
 
 def frame_of(start: Start) -> Frame:

@@ -1,11 +1,16 @@
 """Wrong places and wrong known coordinates of a block.
 
-First robust estimators bring the block near the truth, whatever a fifth of the ties
-says: the sum of absolute residuals, which has one minimum and needs no scale; then the
-redescending weights of Geman and McClure (1987), (c² / (c² + s²))², s the residual in
-standard deviations, with c that falls to `SURE`. Then the block is adjusted without the
-rays that are beyond `CLEAR`, and what is left is tested by its normalised residuals w
-(Baarda 1968), the largest one of each neighbourhood at a time.
+Where a plain adjustment shows that little can be wrong, its normalised residuals w
+(Baarda 1968) are tested in a few rounds, the largest one of each neighbourhood at a
+time. They point at wrong control, which robust estimators would keep at the cost of its
+rays.
+
+If that does not settle it, or much is wrong, robust estimators bring the block near the
+truth first, whatever a fifth of the ties says: the sum of absolute residuals, which has
+one minimum and needs no scale; then the redescending weights of Geman and McClure
+(1987), (c² / (c² + s²))², s the residual in standard deviations, with c that falls to
+`SURE`. Then the block is adjusted without the rays that are beyond `CLEAR`, and what is
+left is tested.
 """
 
 from typing import NamedTuple
@@ -36,6 +41,9 @@ ROUNDS = 8
 
 TESTS = 20
 """Rounds of tests."""
+
+NEARLY_RIGHT, FEW = 2.0, 6
+"""sigma0 of a plain adjustment below which so many rounds of tests come first."""
 
 DATUM = 7
 """Known coordinates that a block needs."""
@@ -76,6 +84,14 @@ def adjust_without_wrong(
     """Adjust a block without its wrong rays and known coordinates. `inner`: the inner
     parameters that are unknown; `bars`: known distances. Raises `TooLittleControl`
     where hardly a known coordinate fits the photos."""
+    nothing = Wrong(
+        np.zeros(len(block.photo), bool), np.zeros((_control_points(ground), 3), bool)
+    )
+    plain = adjust_rest(block, start, ground, nothing, inner, bars)
+    if plain.sigma0 < NEARLY_RIGHT:
+        adjusted, wrong = _test(plain, ground, nothing, level, FEW)
+        if wrong.settled:
+            return adjusted, wrong
     prepared = prepare_block(block, start, ground, inner, bars=bars)
     found = settle(prepared)
     wrong = _far(prepared, found)
@@ -94,10 +110,14 @@ def adjust_without_wrong(
 
 
 def _test(
-    adjusted: BlockAdjustment, ground: Ground | None, wrong: Wrong, level: float
+    adjusted: BlockAdjustment,
+    ground: Ground | None,
+    wrong: Wrong,
+    level: float,
+    rounds: int = TESTS,
 ) -> tuple[BlockAdjustment, Wrong]:
     """The adjustment without what the tests reject, in rounds."""
-    for _ in range(TESTS):
+    for _ in range(rounds):
         more = _worst(adjusted, normalise_residuals(adjusted, level))
         if not (np.any(more.rays) or np.any(more.control)):
             return adjusted, wrong._replace(settled=True)
@@ -222,8 +242,6 @@ def _worst(adjusted: BlockAdjustment, tested: Tested) -> Wrong:
     np.maximum.at(of_point, block.point, of_ray)
     rays = np.zeros(len(block.photo), bool)
     control = np.zeros(tested.control.shape, bool)
-    free_points = np.ones(len(block.points), bool)
-    free_photos = np.ones(len(block.photos), bool)
     if adjusted.ground is not None and len(tested.control) > 0:
         of_known = np.max(np.nan_to_num(np.abs(tested.control)), axis=1)
         worst = int(np.argmax(of_known))
@@ -232,7 +250,10 @@ def _worst(adjusted: BlockAdjustment, tested: Tested) -> Wrong:
         beside = 0.0 if station or number < 0 else of_point[number]
         if of_known[worst] > max(tested.limit, beside):
             control[worst] = True
-            (free_photos if station else free_points)[number] = False
+            # its error is in the residuals of all rays around it
+            return Wrong(rays, control)
+    free_points = np.ones(len(block.points), bool)
+    free_photos = np.ones(len(block.photos), bool)
     for ray in np.argsort(-of_ray):
         if of_ray[ray] <= tested.limit:
             break
