@@ -46,7 +46,8 @@ def classically(
     rigorous one. Raises TableError where the block is too large."""
     adjusted, ground = done.adjusted, done.adjusted.ground
     assert ground is not None
-    usable = np.flatnonzero(done.oriented.usable & _are_neighbours(left, right, points))
+    use = done.oriented.usable & _are_neighbours(left, right, points)
+    usable = np.flatnonzero(use).tolist()
     block = adjusted.block.without(done.oriented.wrong.rays)
     call = lambda: compare_estimators(
         block,
