@@ -22,7 +22,7 @@ INTRODUCTION = """\
 
 `python -m benchmarks --update-baseline` makes this page of [baseline.json](baseline.json). Answers
 are compared before times are measured. The other programs take turns with ours: PoseLib and OpenCV
-in processes of their own, and stock `optimistix.GaussNewton` under `jit(vmap)` on the same residual.
+in processes of their own, stock `optimistix.GaussNewton` under `jit(vmap)` on the same residual.
 Times differ by half between two runs on one machine: only ratios of one suite count. A goal stands
 in brackets, in bold where it is missed; [decisions.md](decisions.md) says why."""
 
