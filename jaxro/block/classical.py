@@ -196,7 +196,15 @@ def adjust_models(
     adjustment = adjust_sparse(
         (ties, control), families, eliminate="point", linked="model"
     )
-    return ClassicalAdjustment(models, ground, units, known, number, sigma, adjustment)
+    return ClassicalAdjustment(
+        models=models,
+        ground=ground,
+        frame=units,
+        known=known,
+        number=number,
+        deviations=sigma,
+        adjustment=adjustment,
+    )
 
 
 def deviations_of(models: ModelCoordinates, start: Start) -> Float[np.ndarray, "row 3"]:

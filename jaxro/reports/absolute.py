@@ -8,7 +8,7 @@ from ..adjustment import critical_values as critical
 from ..block.absolute_result import NAMES
 from ..block.absolute_verdict import RESULTS, advice_of
 from .absolute_files import Done
-from .control import AXES, add_rows, in_words
+from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
 from .pair import digits, join_names, left_out, table
 from .reliability import DOUBTFUL
 from .text import number
@@ -28,25 +28,18 @@ def show(console: Console, done: Done) -> None:
         console.print(accuracy(done), markup=False)
         _elements(console, done)
         _control(console, done)
-        _checks(console, done)
+        show_checks(console, done.checks, "model", done.unit, done.limit_of_checks)
         _points(console, done)
     for sentence in sentences(done):
         console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
 
 
 def _head(console: Console, done: Done) -> None:
-    known = done.control.known
-    plan = np.any(known[:, :2], axis=1)
-    kinds = {
-        "full": plan & known[:, 2],
-        "in plan": plan & ~known[:, 2],
-        "in height": known[:, 2] & ~plan,
-    }
-    told = ", ".join(f"{np.sum(k)} {name}" for name, k in kinds.items() if np.any(k))
+    told = kinds_in_words(done.control.known)
     named = "" if done.title == done.model.pair else f" ({escape(done.model.pair)})"
     console.print(
         f"[bold]Absolute orientation of {escape(done.title)}[/bold]{named}, "
-        f"{len(done.model.names)} points; control {told or 'none'}; "
+        f"{len(done.model.names)} points; control {told}; "
         f"{len(done.checks.names)} check points"
     )
 
@@ -131,19 +124,6 @@ def _control(console: Console, done: Done) -> None:
     add_rows(rows, done.control, done.limit, done.redundancy)
     console.print(rows)
     left_out(console, len(done.control.names), "points, those with the largest shown")
-
-
-def _checks(console: Console, done: Done) -> None:
-    if not done.checks.names:
-        return
-    title = (
-        f"Check points: model minus given [{done.unit}];\n"
-        f"largest |d|/sd, limit {number(done.limit_of_checks, 2)}"
-    )
-    rows = table("point", "dX", "dY", "dZ", "|d|/sd", title=title)
-    add_rows(rows, done.checks, done.limit_of_checks)
-    console.print(rows)
-    left_out(console, len(done.checks.names), "points, those with the largest shown")
 
 
 def _points(console: Console, done: Done) -> None:

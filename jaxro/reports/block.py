@@ -8,7 +8,7 @@ from rich.markup import escape
 from ..adjustment import RESULTS
 from .block_files import ANGLES
 from .block_model import Done
-from .control import AXES, add_rows, in_words
+from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
 from .pair import MOST_ROWS, digits, join_names, left_out, table, worst
 from .reliability import DOUBTFUL
 from .text import number
@@ -31,7 +31,7 @@ def show(console: Console, done: Done) -> None:
         _cameras(console, done)
         _photos(console, done)
         _control(console, done)
-        _checks(console, done)
+        show_checks(console, done.checks, "adjusted", done.unit, done.limit_of_checks)
         _bars(console, done)
     for sentence in sentences(done):
         console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
@@ -39,15 +39,8 @@ def show(console: Console, done: Done) -> None:
 
 def _head(console: Console, done: Done) -> None:
     block = done.adjusted.block
-    known = done.control.known
-    plan = np.any(known[:, :2], axis=1)
-    kinds = {
-        "full": plan & known[:, 2],
-        "in plan": plan & ~known[:, 2],
-        "in height": known[:, 2] & ~plan,
-    }
-    told = ", ".join(f"{np.sum(k)} {name}" for name, k in kinds.items() if np.any(k))
-    ground = "free network" if done.ground is None else f"control {told or 'none'}"
+    told = kinds_in_words(done.control.known)
+    ground = "free network" if done.ground is None else f"control {told}"
     checks = f"; {len(done.checks.names)} check points" if done.ground else ""
     if done.adjusted.bars is not None:
         checks += f"; {len(done.adjusted.bars.one)} scale bars"
@@ -237,19 +230,6 @@ def _control(console: Console, done: Done) -> None:
     add_rows(rows, done.control, limit, done.control_redundancy)
     console.print(rows)
     left_out(console, len(done.control.names), "points, those with the largest shown")
-
-
-def _checks(console: Console, done: Done) -> None:
-    if not done.checks.names:
-        return
-    title = (
-        f"Check points: adjusted minus given [{done.unit}];\n"
-        f"largest |d|/sd, limit {number(done.limit_of_checks, 2)}"
-    )
-    rows = table("point", "dX", "dY", "dZ", "|d|/sd", title=title)
-    add_rows(rows, done.checks, done.limit_of_checks)
-    console.print(rows)
-    left_out(console, len(done.checks.names), "points, those with the largest shown")
 
 
 def _bars(console: Console, done: Done) -> None:

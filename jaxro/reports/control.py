@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .pair import digits, worst
+from .pair import digits, left_out, table, worst
 from .text import number
 
 AXES = ("X", "Y", "Z")
@@ -37,6 +38,20 @@ class Compared:
             float(np.sqrt(np.mean(d[k] ** 2))) if np.any(k) else np.nan
             for d, k in zip(self.differences.T, self.known.T, strict=True)
         ]
+
+
+def kinds_in_words(known: Bool[np.ndarray, "point 3"]) -> str:
+    """How many points are known in what: 3 full, 2 in plan, 3 in height."""
+    plan = np.any(known[:, :2], axis=1)
+    kinds = {
+        "full": plan & known[:, 2],
+        "in plan": plan & ~known[:, 2],
+        "in height": known[:, 2] & ~plan,
+    }
+    return (
+        ", ".join(f"{np.sum(k)} {name}" for name, k in kinds.items() if np.any(k))
+        or "none"
+    )
 
 
 def in_words(one: Compared, unit: str) -> str:
@@ -68,6 +83,22 @@ def add_rows(
             ]
         style = "yellow" if sizes[k] > limit else None
         rows.add_row(escape(one.names[k]), *cells, number(sizes[k], 2), style=style)
+
+
+def show_checks(
+    console: Console, checks: Compared, place: str, unit: str, limit: float
+) -> None:
+    """The table of check points, if there are any: `place` minus given coordinates."""
+    if not checks.names:
+        return
+    title = (
+        f"Check points: {place} minus given [{unit}];\n"
+        f"largest |d|/sd, limit {number(limit, 2)}"
+    )
+    rows = table("point", "dX", "dY", "dZ", "|d|/sd", title=title)
+    add_rows(rows, checks, limit)
+    console.print(rows)
+    left_out(console, len(checks.names), "points, those with the largest shown")
 
 
 def control_rows(
