@@ -128,17 +128,28 @@ def _cell(rows: list[Row]) -> str:
 
 
 def _missed(metrics: Iterable[Metric]) -> str:
-    """A line for each goal that is missed, by one workload or several."""
-    lines = []
+    """A line for each goal that several workloads miss, and for each workload that misses
+    goals of its own."""
+    lines, alone = [], []
     for (what, goal), missed in _grouped(
         [metric for metric in metrics if metric.missed],
         lambda metric: (_split(metric).what, metric.goal_text),
     ).items():
+        if len(missed) == 1:
+            alone += missed
+            continue
         values = "; ".join(
             f"{_split(metric).workload} {metric.value:.3g} {metric.unit}"
             for metric in missed
         )
         lines.append(f"* {what} {goal}: {values}".replace("*  ", "* "))
+    for workload, missed in _grouped(alone, lambda m: _split(m).workload).items():
+        values = "; ".join(
+            f"{_split(metric).what} {metric.value:.3g} {metric.unit} "
+            f"({metric.goal_text})".lstrip()
+            for metric in missed
+        )
+        lines.append(f"* {workload}: {values}")
     return "\n".join(lines) or "None."
 
 
