@@ -167,16 +167,22 @@ def lengths(size: Size) -> list[Metric]:
     one, many = aerial(len(drawn), mean), aerial(len(drawn), int(drawn.max()))
     begins = np.concatenate([[0], np.cumsum(drawn)])
     there = np.arange(many[0].shape[1])[None, :] < drawn[:, None]
-    focals = (np.full(len(drawn), FOCAL),) * 2
+    focal = np.full(len(drawn), FOCAL)
+    focals = {"focal_left": focal, "focal_right": focal}
     rows = int(begins[-1])
     uneven = ragged.Ragged(
-        begins, *(c[there] for c in many), np.ones(rows), np.ones(rows, bool), *focals
+        begins,
+        *(c[there] for c in many),
+        sigma=np.ones(rows),
+        mask=np.ones(rows, bool),
+        **focals,
     )
     even = ragged.Ragged(
         np.arange(len(drawn) + 1) * mean,
         *(c.ravel() for c in one),
-        *(np.ones(one[0].size, t) for t in (float, bool)),
-        *focals,
+        sigma=np.ones(one[0].size),
+        mask=np.ones(one[0].size, bool),
+        **focals,
     )
     plan = plan_for(np.tile(drawn, 64), 64)  # as of a part of a long table
     calls = {

@@ -145,7 +145,7 @@ def _heights(
         return z, moved, (*by_first[:2], *by_right[:2])
 
     z, moved, by_coordinate = jax.vmap(of_point)(_corrected(pair, linear), shift)
-    return z, moved - dot(by_coordinate, linear.gradient) * left, by_coordinate
+    return z, moved - dot(by_coordinate, linear.lever) * left, by_coordinate
 
 
 def _height(first, second, base, third):

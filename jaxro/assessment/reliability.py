@@ -9,7 +9,7 @@ Förstner 1979, 1987; Caspary 1988):
     Baarda's w                g / (sigma0 sqrt(D r))                       normal
     internally studentised    tau: the estimated sigma0 in its place       tau distribution of n - 5
     externally studentised    t: sigma0 estimated without this point       Student's t of n - 6
-    of a coordinate           r_k = r B_k² Q_k / D
+    of a coordinate           r_k = r B_k (Q Bᵀ)_k / D, r B_k² Q_k / D without covariances
     detectable error          delta0 sigma0 sqrt(Q_k / r_k) = delta0 sigma0 sqrt(D / r) / |B_k|
     effect on the elements    N⁻¹ aᵀ / D times the error of g, delta0 sigma0 sqrt(D / r)
     external reliability      delta0 sqrt(h / r): no function of the elements moves by more
@@ -73,7 +73,10 @@ class Reliability(eqx.Module):
     the estimated one, and w is then tau. `limit`: without an error |w| exceeds it with
     probability `level`; `delta0`: the error that is found with the wanted `power`, in
     standard deviations of w. Numbers that follow from others are properties, so that a
-    batch does not store them.
+    batch does not store them. `shown`: where the coordinates of a point are not equally
+    accurate, how much of an error of a coordinate shows, r B_k² sigma² / D; else it is
+    `coordinate_redundancy`. With covariances between x and y a coordinate may have a
+    redundancy number below 0 or above 1; only the sum has its usual meaning.
     """
 
     used: Bool[Array, "*pairs point"]
@@ -94,6 +97,7 @@ class Reliability(eqx.Module):
     delta0: PerPair
     known: bool = eqx.field(static=True)
     power: float = eqx.field(static=True)
+    shown: Coordinates | None = None
 
     @property
     def redundancy(self) -> Derived:
@@ -138,7 +142,8 @@ class Reliability(eqx.Module):
             finite = size / xp.sqrt(xp.where(seen, r, 1.0))
             return xp.where(self.used, xp.where(seen, finite, xp.inf), 0.0)
 
-        return tuple(error(r) for r in self.coordinate_redundancy)
+        shown = self.coordinate_redundancy if self.shown is None else self.shown
+        return tuple(error(r) for r in shown)
 
     @property
     def external(self) -> Derived:
@@ -258,7 +263,8 @@ def assess(
 def _unit_of(pair: Pair, sigma0: ArrayLike | None, sigma: float) -> float:
     """The standard deviation of unit weight where all coordinates have this one. Raises
     ValueError where another is told."""
-    own = not is_traced(pair.sigma) and np.any(np.asarray(pair.sigma) != 1)
+    own = pair.roots is not None
+    own = own or (not is_traced(pair.sigma) and np.any(np.asarray(pair.sigma) != 1))
     if sigma0 is not None or own:
         told = "the pair has its own" if own else "sigma0 is given too"
         raise ValueError(
@@ -283,8 +289,10 @@ def _assess(
     tables = tests(pair.mask.shape[0], known, level, power, familywise)
     delta, limit, each = (critical.look_up(table, checks.points) for table in tables)
     factors = [b**2 * pair.sigma**2 * linear.weight for b in linear.gradient]
-    parts = tuple(factor * checks.redundancy for factor in factors)
-    hidden = _hidden(pair, orientation, linear, checks, parts, delta)
+    parts = shown = tuple(factor * checks.redundancy for factor in factors)
+    if pair.roots is not None:
+        parts = _redundancy_of_coordinates(pair, linear, checks)
+    hidden = _hidden(pair, orientation, linear, checks, shown, delta)
     usable = orientation.usable
     most = lambda value: jnp.where(usable, jnp.max(value, axis=-1), jnp.inf)
     return Reliability(
@@ -304,9 +312,19 @@ def _assess(
         level=each,
         limit=limit,
         delta0=delta,
+        shown=None if pair.roots is None else shown,
         known=known,
         power=power,
     )
+
+
+def _redundancy_of_coordinates(
+    pair: Pair, linear: Linear, checks: Checks
+) -> Coordinates:
+    """r B_k (Q Bᵀ)_k / D of every coordinate: the diagonal of Q_v Q⁻¹."""
+    factor = pair.sigma**2 * linear.weight * checks.redundancy
+    both = zip(linear.gradient, linear.lever, strict=True)
+    return tuple(factor * b * along for b, along in both)
 
 
 def _hidden(
@@ -314,11 +332,11 @@ def _hidden(
     orientation: Orientation,
     linear: Linear,
     checks: Checks,
-    parts: Coordinates,
+    shown: Coordinates,
     delta: Array,
 ) -> Effects:
     """The effects of errors that are just detectable; infinite where an error does not
-    show, zero where a point is not used."""
+    show, zero where a point is not used. `shown`: r B_k² sigma² / D."""
     size = delta * checks.unit * checks.spread / checks.divisor
     size = jnp.where(checks.testable, size, 0.0)
     jump, shift = computed_once(_displace)(checks.shifts, linear.weight, size)
@@ -332,7 +350,7 @@ def _hidden(
         m_q=bound(found.m_q, checks.testable),
         height=tuple(
             bound(z, checks.testable & (part > UNTESTABLE))
-            for z, part in zip(found.height, parts, strict=True)
+            for z, part in zip(found.height, shown, strict=True)
         ),
     )
 

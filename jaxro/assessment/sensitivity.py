@@ -121,7 +121,7 @@ def derivatives(pair: Pair, quantity: Quantity, **options) -> Derivatives:
 def _derivatives(pair: Pair, *, quantity: Quantity, **options) -> Derivatives:
     def result(inputs):
         *coordinates, left, right = inputs
-        measured = Pair(*coordinates, pair.sigma, pair.mask, left, right)
+        measured = Pair(*coordinates, pair.sigma, pair.mask, left, right, pair.roots)
         found = orient(measured, **options)
         value = quantity(found)
         return value, (value, found.usable)

@@ -97,6 +97,11 @@ def estimate(
             "variance_components: wants (pair, point) coordinates and four groups, "
             f"got {shape}, {len(groups)}"
         )
+    if pairs.roots is not None:
+        raise ValueError(
+            "variance_components: the pairs have covariances of their points; groups of "
+            "coordinates share one variance each, so make the pairs without them"
+        )
     with jax.ensure_compile_time_eval():
         labels = [jnp.asarray(g) for g in groups]
         names = sorted({int(v) for g in labels for v in jnp.unique(g)})

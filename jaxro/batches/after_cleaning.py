@@ -161,6 +161,8 @@ def _repeat(
     wrong = draw_points(which, exact.mask, number)
     sigma = (unit * exact.sigma)[None, :]
     errors = sigma * jax.random.normal(noise, (4, *points))
+    if exact.roots is not None:
+        errors = jnp.stack(exact.roots.displace(tuple(errors)))
     partners = jnp.where(wrong[None, :], _wrong_partners(size, most, points), 0.0)
     x_right, y_right = errors[2:] + partners
     measured = plant(
@@ -190,8 +192,8 @@ def _largest_error(
     f = coplanarity.fundamental_matrix(
         *pose.relative(), pair.focal_left, pair.focal_right
     )
-    correct = lambda point, use: coplanarity.corrections(f, point, use)
-    corrections = jax.vmap(correct)(pair.coordinates, rejected)
+    correct = lambda point, use, roots: coplanarity.corrections(f, point, use, roots)
+    corrections = jax.vmap(correct)(pair.coordinates, rejected, pair.roots)
     size = jnp.max(jnp.abs(jnp.stack(corrections)))
     sigma = jnp.max(jnp.where(pair.mask, pair.sigma, 0.0))
     return jnp.maximum(2 * size, 10 * sigma * unit)
@@ -215,16 +217,16 @@ def errorless(
         z = jnp.where(z < 0, z, -focal_left)
         return -focal_right * x / z, -focal_right * y / z
 
-    def move(point, use):
+    def move(point, use, roots):
         moved = point
         for _ in range(2):  # the correction is of first order
-            v = coplanarity.corrections(f, moved, use)
+            v = coplanarity.corrections(f, moved, use, roots)
             moved = tuple(c + e for c, e in zip(moved, v, strict=True))
         x, y, *_ = point
         other = (x, y, *partner(x, y))
         return tuple(jnp.where(use, a, b) for a, b in zip(moved, other, strict=True))
 
-    return jax.vmap(move)(pair.coordinates, kept)
+    return jax.vmap(move)(pair.coordinates, kept, pair.roots)
 
 
 def _mean_nearness(

@@ -38,11 +38,14 @@ from ..xla.settings import (
     WIDE_VECTORS,
     settings_for,
 )
-from ..xla.slabs import Progress, Split, map_chunks, silent, spread
+from ..xla.slabs import Progress, Split, has_caches, map_chunks, silent, spread
 
 CHUNK_POINTS = 16384
 """Points per chunk: a working set of a few hundred kB, which stays in the cache of one
 core."""
+
+POINTS_AT_ONCE, SEARCHED_AT_ONCE = 1 << 20, 1 << 10
+"""Points per chunk, and pairs in a call that searches, on other devices than a CPU."""
 
 ALONE = 1 << 15
 """Points of a batch that are oriented from the vertical before other threads have
@@ -297,6 +300,8 @@ def _split_of(procedure: PyTree, pairs: Pair, split: Split) -> tuple[Split, int]
     any number of pairs, so that all calls have one shape and one program."""
     is_search = lambda part: isinstance(part, AbstractHypotheses | Search)
     searches = any(map(is_search, jax.tree.leaves(procedure, is_leaf=is_search)))
+    if split.chunk is None and searches and not has_caches():
+        return split, SEARCHED_AT_ONCE
     if split.chunk is None and searches:
         return split._replace(slab=split.slab or SEARCHED), 1
     return split, _chunk(pairs, split.chunk)
@@ -311,6 +316,8 @@ def _chunk(pairs: Any, chunk: int | None) -> int:
         )
     if chunk is not None:
         return operator.index(chunk)
+    if not has_caches():
+        return 1 << (POINTS_AT_ONCE // max(pairs.x_left.shape[1], 1)).bit_length() - 1
     if pairs.x_left.size <= SHORT:
         return 1
     fitting = max(CHUNK_POINTS // max(pairs.x_left.shape[1], 1), 4)

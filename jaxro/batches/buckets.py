@@ -14,6 +14,9 @@ from .ragged import Ragged
 
 Rows = Int[np.ndarray, " _"]
 
+OF_PAIRS = ("begins", "focal_left", "focal_right")
+"""The fields of `Ragged` that have no value for each row."""
+
 
 def buckets(lengths: list[int], most: int = SIZES) -> dict[int, list[int]]:
     """Indices of the pairs to be padded to each of `padding.sizes`, at most so many."""
@@ -27,12 +30,13 @@ def buckets(lengths: list[int], most: int = SIZES) -> dict[int, list[int]]:
 def choose(pairs: Ragged, members: Rows, rows: Sequence[Rows]) -> Ragged:
     """These pairs with these of their rows."""
     flat = np.concatenate(rows)
-    values = {
-        name: column[members if name.startswith("focal") else flat]
-        for name, column in pairs._asdict().items()
-        if name != "begins"
-    }
-    return Ragged(begins=np.cumsum([0] + [len(own) for own in rows]), **values)
+    of_rows = lambda column: column[flat]
+    chosen = jax.tree.map(of_rows, pairs._replace(**dict.fromkeys(OF_PAIRS)))
+    return chosen._replace(
+        begins=np.cumsum([0] + [len(own) for own in rows]),
+        focal_left=pairs.focal_left[members],
+        focal_right=pairs.focal_right[members],
+    )
 
 
 def by_size(

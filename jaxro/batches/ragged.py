@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
-from ..geometry.pairs import Pair, double, pair
+from ..geometry.cofactor_roots import UNIT, CofactorRoots
+from ..geometry.pairs import Pair, double, pair, with_roots
 from ..orientation.result import PER_POINT, Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..rejection import AbstractProcedure, Rejection
@@ -38,7 +38,7 @@ Flat = Float[np.ndarray, " row"]
 
 class Ragged(NamedTuple):
     """Pairs of any lengths one behind the other, in NumPy: pair k has the rows
-    `begins[k]` to `begins[k + 1]`."""
+    `begins[k]` to `begins[k + 1]`. `roots` as of a `Pair`, for every row."""
 
     begins: Int[np.ndarray, " pairs+1"]
     x_left: Flat
@@ -49,6 +49,7 @@ class Ragged(NamedTuple):
     mask: Bool[np.ndarray, " row"]
     focal_left: Float[np.ndarray, " pair"]
     focal_right: Float[np.ndarray, " pair"]
+    roots: CofactorRoots | None = None
 
     @property
     def lengths(self) -> Int[np.ndarray, " pair"]:
@@ -66,6 +67,7 @@ class Ragged(NamedTuple):
             self.y_right,
             self.sigma,
             self.mask,
+            *(self.roots or ()),
         )
         if last - first + 1 == len(members) and np.all(
             lengths == size
@@ -85,12 +87,11 @@ class Ragged(NamedTuple):
                 enough(a), size
             )
             fields = [windows(a)[self.begins[members]] for a in points]
-            fields[-1] = np.logical_and(
-                fields[-1], np.arange(size)[None, :] < lengths[:, None]
-            )
-        return jax.tree.unflatten(
-            _structure(), [*fields, self.focal_left[members], self.focal_right[members]]
-        )
+            there = np.arange(size)[None, :] < lengths[:, None]
+            fields[5] = np.logical_and(fields[5], there)
+        of_pairs = self.focal_left[members], self.focal_right[members]
+        structure = _structure(self.roots is not None)
+        return jax.tree.unflatten(structure, [*fields[:6], *of_pairs, *fields[6:]])
 
     def gather(
         self,
@@ -115,11 +116,10 @@ class Ragged(NamedTuple):
 
 
 @lru_cache
-def _structure() -> Any:
-    """Of a `Pair`, to be filled with arrays of NumPy."""
-    return jax.tree.structure(
-        jax.eval_shape(lambda: pair(*(jnp.zeros((4, 1))), focal=1.0))
-    )
+def _structure(roots: bool) -> Any:
+    """Of a `Pair`, with roots or without, to be filled with arrays of NumPy."""
+    one = pair(*np.zeros((4, 1)), focal=1.0)
+    return jax.tree.structure(with_roots(one) if roots else one)
 
 
 def join(pairs: Sequence[Pair]) -> Ragged:
@@ -131,33 +131,37 @@ def join(pairs: Sequence[Pair]) -> Ragged:
             "join: single pairs are wanted, got a batch (pair, point): take it apart "
             "with unstack"
         )
+    if any(one.roots is not None for one in pairs):
+        pairs = [with_roots(one) for one in pairs]
     begins = np.cumsum([0] + [one.x_left.shape[-1] for one in pairs])
-    fields = {
-        name: [np.asarray(getattr(one, name)) for one in pairs]
-        for name in Ragged._fields[1:]
-    }
-    return Ragged(
-        begins,
-        *(
-            np.stack(a) if name.startswith("focal") else np.concatenate(a)
-            for name, a in fields.items()
-        ),
+    together = lambda *fields: (
+        np.concatenate(fields) if np.ndim(fields[0]) else np.stack(fields)
     )
+    host = [jax.tree.map(np.asarray, one) for one in pairs]
+    flat = jax.tree.map(together, *host)
+    return Ragged(begins, *(getattr(flat, name) for name in Ragged._fields[1:]))
+
+
+def with_roots_of_rows(pairs: Ragged) -> Ragged:
+    """The pairs with `roots`: if they have none, those of equally accurate
+    coordinates."""
+    if pairs.roots is not None:
+        return pairs
+    fill = lambda value: np.full(len(pairs.x_left), value)
+    return pairs._replace(roots=CofactorRoots(*map(fill, UNIT)))
 
 
 def concatenate(parts: Sequence[Ragged]) -> Ragged:
     """The pairs of several `Ragged` one behind the other."""
+    if any(part.roots is not None for part in parts):
+        parts = [with_roots_of_rows(part) for part in parts]
     ends = np.cumsum([0] + [part.begins[-1] for part in parts])
     begins = np.concatenate(
         [[0], *(part.begins[1:] + end for part, end in zip(parts, ends, strict=False))]
     )
-    return Ragged(
-        begins,
-        *(
-            np.concatenate(fields)
-            for fields in zip(*(part[1:] for part in parts), strict=True)
-        ),
-    )
+    together = lambda *fields: np.concatenate(fields)
+    rows = [part._replace(begins=None) for part in parts]
+    return jax.tree.map(together, *rows)._replace(begins=begins)
 
 
 def check(pairs: Ragged) -> Ragged:

@@ -115,8 +115,15 @@ def from_pairs(
 
     A place that several pairs share is one measurement. Two places of a point on one
     photo that differ are two measurements of it; `TwoPoints` is raised where they are
-    too far apart for that, ValueError where a photo has two focal lengths.
+    too far apart for that, ValueError where a photo has two focal lengths, and for
+    pairs with covariances: here a place has one standard deviation.
     """
+    if pairs.roots is not None:
+        raise ValueError(
+            "from_pairs: the points have covariances, but a place of a block has one "
+            "standard deviation: leave them out, pairs._replace(roots=None), which "
+            "keeps the mean of each point"
+        )
     photos, both = np.unique(np.array([left, right]), return_inverse=True)
     both = both.reshape(2, -1)
     names, point = np.unique(np.asarray(points), return_inverse=True)

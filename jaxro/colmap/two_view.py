@@ -1,6 +1,7 @@
 """COLMAP's two-view geometry of an oriented pair: configuration and matrices.
 
-With D = diag(1, -1, -1) (`cameras`) a pose R, b of jaxro is in COLMAP's frames
+With D = diag(1, -1, -1) a pose R, b of jaxro is in COLMAP's frames
+(`geometry.camera_axes`)
 
     cam2_from_cam1:  R' = D Rᵀ D,  t = -R' D b,    E = [t]x R',
     F = K2⁻ᵀ E K1⁻¹,    H = K2 (R' + t (D n)ᵀ) K1⁻¹
@@ -13,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..geometry.camera_axes import SIGNS, invert, to_camera_axes
 from ..rejection.classification import Found, Kind
 from .database import Geometry, Matches
 
@@ -67,15 +69,13 @@ def geometries(
 def matrices(found: Found, k1: Matrices, k2: Matrices) -> dict[str, np.ndarray]:
     """F, E, H, qvec and tvec of every pair; without a base H and tvec are those of the
     rotation alone."""
-    signs = np.array([1.0, -1.0, -1.0])  # the diagonal of D
-    rotation = np.swapaxes(found.rotation, 1, 2)
-    rotation = signs[:, None] * rotation * signs
-    t = -np.einsum("pij,pj->pi", rotation, signs * found.base)
+    placed = to_camera_axes(np.asarray(found.rotation), np.asarray(found.base))
+    rotation, t = invert(*placed)
     without_base = found.kind == Kind.rotation
     t = np.where(without_base[:, None], 0.0, t)
     columns = [np.cross(t, rotation[:, :, k]) for k in range(3)]
     essential = np.stack(columns, axis=-1)
-    plane = t[:, :, None] * (signs * found.normal)[:, None, :]
+    plane = t[:, :, None] * (SIGNS * found.normal)[:, None, :]
     k1_inverse = np.linalg.inv(k1)
     k2_inverse_transposed = np.swapaxes(np.linalg.inv(k2), 1, 2)
     # the inverse of a rotation, its axis mirrored by D: of the quaternion -x

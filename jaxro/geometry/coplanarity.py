@@ -16,11 +16,12 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..adjustment.residuals import Residuals
 from ..adjustment.terms import Term
 from . import rotations as rot
+from .cofactor_roots import CofactorRoots
 from .elements import AbstractElements, essential
 from .pairs import Pair
 from .rotations import Matrix, Vector
@@ -107,14 +108,25 @@ def rigorous(pair: Pair) -> Term:
     prepare = lambda rotation, base: fundamental_matrix(
         rotation, base, pair.focal_left, pair.focal_right
     )
-    return Term(
-        condition,
-        pair.coordinates,
-        pair.sigma**2,
-        mask=pair.mask,
-        prepare=prepare,
-        bilinear=True,
-    )
+    if pair.roots is None:
+        measured = condition, pair.coordinates, pair.sigma**2
+    else:
+        measured = _with_covariances(pair)
+    return Term(*measured, mask=pair.mask, prepare=prepare, bilinear=True)
+
+
+def _with_covariances(pair: Pair) -> tuple[Callable, PyTree, PyTree]:
+    """The condition, observations and cofactor of points whose coordinates are not
+    equally accurate: what is measured are the z of the coordinates l + L z, all of
+    variance sigma², and z = 0."""
+
+    def of_point(f: Matrix, observation: tuple) -> Scalar:
+        z, point, roots = observation
+        shift = roots.displace(z)
+        return condition(f, tuple(c + d for c, d in zip(point, shift, strict=True)))
+
+    z = tuple(jnp.zeros_like(c) for c in pair.coordinates)
+    return of_point, (z, pair.coordinates, pair.roots), (pair.sigma**2, None, None)
 
 
 def residuals(pair: Pair, pose: AbstractElements) -> Residuals:
@@ -124,7 +136,8 @@ def residuals(pair: Pair, pose: AbstractElements) -> Residuals:
 
 def parallax(pair: Pair) -> Term:
     """Adjust the y-parallax of every point as if it had been measured; the coordinates
-    are taken as free of error."""
+    are taken as free of error, so that their covariances (`Pair.roots`) play no part:
+    sigma² is the variance of q."""
 
     def prepare(rotation: Matrix, base: Vector):
         left, right = turn_to_base(rotation, base)
@@ -141,23 +154,33 @@ def parallax(pair: Pair) -> Term:
 
 
 def linearise(
-    f: Matrix, point: Point, use: Bool[Array, "..."]
+    f: Matrix,
+    point: Point,
+    use: Bool[Array, "..."],
+    roots: CofactorRoots | None = None,
 ) -> tuple[Scalar, Scalar, Point]:
     """g of one point, the square |B|² of its gradient by the coordinates (1 where it is
-    not used), and B itself."""
+    not used), and B itself; with the `roots` L of the point, B L in place of B."""
     g, gradient = jax.value_and_grad(condition, argnums=1)(f, point)
+    if roots is not None:
+        gradient = roots.pull(gradient)
     return g, jnp.where(use, sum(entry**2 for entry in gradient), 1.0), gradient
 
 
-def corrections(f: Matrix, point: Point, use: Bool[Array, "..."]) -> Point:
+def corrections(
+    f: Matrix,
+    point: Point,
+    use: Bool[Array, "..."],
+    roots: CofactorRoots | None = None,
+) -> Point:
     """v = -Q Bᵀ (B Q Bᵀ)⁻¹ g: what brings the rays of one point to intersection with
-    the shortest v.
-
-    sigma is equal for the four coordinates of a point, so it cancels.
+    the smallest vᵀ Q⁻¹ v; sigma cancels. `roots`: of Q = L Lᵀ, where the coordinates
+    of the point are not equally accurate.
     """
-    g, square, gradient = linearise(f, point, use)
+    g, square, gradient = linearise(f, point, use, roots)
     factor = jnp.where(use, -g / square, 0.0)
-    return tuple(factor * entry for entry in gradient)  # pyright: ignore[reportReturnType]
+    v = tuple(factor * entry for entry in gradient)
+    return v if roots is None else roots.displace(v)  # pyright: ignore[reportReturnType]
 
 
 def directions(

@@ -27,8 +27,8 @@ def model_point(
     scale: Float[Array, ""],
     noise: Float[Array, ""],
 ) -> Callable:
-    """A function of the coordinates of a point, their standard deviation and whether it
-    is used: (X, Y, Z) in the frame of the chosen elements with a base of length
+    """A function of the coordinates of a point, their standard deviation, whether it
+    is used, and its `roots`: (X, Y, Z) in the frame of the chosen elements with a base of length
     `scale`; whether it lies in front of both photos; and whether behind one of them,
     though not infinitely far, nor so far that `noise` times its deviation could have
     put it there. Zero and False where it is not used."""
@@ -37,8 +37,8 @@ def model_point(
     f = coplanarity.fundamental_matrix(rotation, base, *focals)
     frame, right, placed = _in_frame(chosen, rotation, base, scale)
 
-    def of_point(point, sigma, use):
-        v = coplanarity.corrections(f, point, use)
+    def of_point(point, sigma, use, roots):
+        v = coplanarity.corrections(f, point, use, roots)
         corrected = tuple(c + dv for c, dv in zip(point, v, strict=True))
         rays = coplanarity.directions(None, rotation, corrected, *focals)
         lam, mu, near = coplanarity.depths(*rays, base)

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from ..adjustment.normal_equations import Lower, accumulate
 from . import coplanarity
+from .cofactor_roots import CofactorRoots
 from .elements import AbstractElements
 from .pairs import Coordinates, Pair
 
@@ -28,12 +29,22 @@ Values = Float[Array, "point"]
 
 class Linear(NamedTuple):
     """The linearised conditions of all points: `g`, the five `columns` of a, the
-    `gradient` B, and the `weight` 1 / d. All are zero where a point is masked."""
+    `gradient` B, and the `weight` 1 / d. All are zero where a point is masked. `roots`:
+    those of the pair."""
 
     g: Values
     columns: list[Values]
     gradient: Coordinates
     weight: Values
+    roots: CofactorRoots | None = None
+
+    @property
+    def lever(self) -> Coordinates:
+        """Q Bᵀ / sigma²: B itself where the coordinates of a point are equally
+        accurate."""
+        if self.roots is None:
+            return self.gradient
+        return self.roots.displace(self.roots.pull(self.gradient))
 
     @property
     def squares(self) -> Values:
@@ -44,7 +55,7 @@ class Linear(NamedTuple):
         """v = -Q Bᵀ g / d: corrections of the coordinates with which the rays
         intersect."""
         factor = -self.g * self.weight * pair.sigma**2
-        return tuple(factor * b for b in self.gradient)
+        return tuple(factor * entry for entry in self.lever)
 
     def times(self, x: Sequence[Any]) -> Values:
         """A x of every point: the change of g by these local parameters, which may
@@ -81,6 +92,7 @@ def linearise(pair: Pair, elements: AbstractElements) -> Linear:
         columns=[used(column) for (column,) in jacobian],
         gradient=tuple(used(b) for b in gradient),
         weight=weight[0],
+        roots=pair.roots,
     )
 
 

@@ -163,13 +163,17 @@ def plant(
         c + jnp.where(one.mask, jnp.asarray(e, float), 0.0)
         for c, e in zip(one.coordinates, errors, strict=True)
     ]
-    return Pair(*moved, one.sigma, one.mask, one.focal_left, one.focal_right)
+    fields = one.sigma, one.mask, one.focal_left, one.focal_right, one.roots
+    return Pair(*moved, *fields)
 
 
 def noisy(one: Pair, key: PRNGKeyArray, sigma: ArrayLike) -> Pair:
     """The pair with normal errors of standard deviation `sigma` (mm) in all four
-    coordinates of its points."""
+    coordinates of its points; with `roots` of the covariances that these have with
+    it."""
     errors = sigma * jax.random.normal(key, (4, *one.x_left.shape), float)
+    if one.roots is not None:
+        errors = one.roots.displace(tuple(errors))
     return plant(
         one, x_left=errors[0], y_left=errors[1], x_right=errors[2], y_right=errors[3]
     )

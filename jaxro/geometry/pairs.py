@@ -19,6 +19,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..xla.passes import count, total
 from ..xla.programs import is_traced
+from . import cofactor_roots
+from .cofactor_roots import UNIT, CofactorRoots
 
 Coordinates = tuple[Float[Array, "*pairs point"], ...]
 """x_left, y_left, x_right, y_right"""
@@ -82,6 +84,9 @@ class Pair(eqx.Module):
     `sigma` is the standard deviation of each of the four coordinates of a point; 1
     means unit weight, and sigma0 is then the standard deviation of a coordinate in the
     unit of the coordinates.
+
+    `roots`: where the coordinates of a point are not equally accurate, or depend on
+    each other. sigma² then is the mean of their variances. None for all other pairs.
     """
 
     x_left: Float[Array, "*pairs point"]
@@ -92,6 +97,7 @@ class Pair(eqx.Module):
     mask: Bool[Array, "*pairs point"]
     focal_left: Float[Array, "*pairs"]
     focal_right: Float[Array, "*pairs"]
+    roots: CofactorRoots | None = None
 
     @property
     def coordinates(self) -> Coordinates:
@@ -111,6 +117,16 @@ class Pair(eqx.Module):
         mean = total(weight) / jnp.maximum(self.count, 1.0)
         return self.mask & (weight * COARSE**2 < mean[..., None])
 
+    @property
+    def covariances(self) -> tuple[Float[np.ndarray, "*pairs point 2 2"], ...]:
+        """The covariance matrices of (x, y) of every point, left and right, in
+        NumPy."""
+        roots = with_roots(self).roots
+        assert roots is not None
+        variance = np.asarray(self.sigma, float)[..., None, None] ** 2
+        left, right = roots.cofactors
+        return left * variance, right * variance
+
     def with_mask(self, mask: Values) -> "Pair":
         """The same pair with other points taking part. Raises ValueError where the
         shapes do not agree."""
@@ -123,7 +139,8 @@ class Pair(eqx.Module):
         return eqx.tree_at(lambda pair: pair.mask, self, new)
 
     def with_sigma(self, sigma: ArrayLike) -> "Pair":
-        """The same pair with other standard deviations, of all points or of each."""
+        """The same pair with other standard deviations, of all points or of each; with
+        `roots` they are those of the mean variances."""
         new = jnp.broadcast_to(
             jnp.asarray(sigma, self.sigma.dtype), jnp.shape(self.sigma)
         )
@@ -140,15 +157,23 @@ def pair(
     sigma: Values | None = None,
     weight: Values | None = None,
     mask: Values | None = None,
+    covariances: tuple[Values, Values] | None = None,
 ) -> Pair:
     """A `Pair` from four equally long coordinate arrays (leading batch axes allowed).
 
     `focal`: one focal length, or (left, right). `sigma`: standard deviation of a
     coordinate, per point or for all (default 1). `weight`: relative weights, sigma /
-    sqrt(weight); weight 0 leaves the point out. Raises ValueError where the shapes do
-    not agree, and for what are no real numbers.
+    sqrt(weight); weight 0 leaves the point out. `covariances`, in place of sigma: the
+    covariance matrices of (x, y) in the left photo and in the right one, (..., point,
+    2, 2) each or one for all. Raises ValueError where the shapes do not agree, and for
+    what are no real numbers.
     """
     dtype = jnp.result_type(float)
+    if covariances is not None and sigma is not None:
+        raise ValueError(
+            "pair: sigma and covariances are given; the variances of the coordinates "
+            "are in the covariances, leave out sigma"
+        )
     if isinstance(focal, tuple | list) and len(focal) != 2:
         raise ValueError(
             f"pair: focal must be one focal length, or (left, right), got {len(focal)} "
@@ -189,6 +214,9 @@ def pair(
                 f"pair: {name} has shape {c.shape}, x_left has {shape}; all four must "
                 "agree"
             )
+    roots = None
+    if covariances is not None:
+        sigma, roots = cofactor_roots.read_covariances(covariances, shape, mask)
     try:
         taking_part = xp.broadcast_to(
             xp.array(True if mask is None else mask, bool), shape
@@ -211,7 +239,19 @@ def pair(
             f"lengths {shape[:-1]}"
         )
         raise ValueError(f"pair: {fit}: {error}") from None
-    return _as_pair([*coordinates, deviation, taking_part, *focals])
+    return _as_pair(
+        [*coordinates, deviation, taking_part, *focals, *jax.tree.leaves(roots)]
+    )
+
+
+def with_roots(one: Pair) -> Pair:
+    """The pair with `roots`: if it has none, those of equally accurate coordinates."""
+    if one.roots is not None:
+        return one
+    xp = _library(one)
+    fill = lambda value: xp.full(one.x_left.shape, value, one.x_left.dtype)
+    roots, none = CofactorRoots(*map(fill, UNIT)), lambda leaf: leaf is None
+    return eqx.tree_at(lambda pair: pair.roots, one, roots, is_leaf=none)
 
 
 def _library(values: PyTree) -> ModuleType:
@@ -222,8 +262,10 @@ def _library(values: PyTree) -> ModuleType:
 
 def _as_pair(fields: list) -> Pair:
     """A `Pair` of these arrays, which nobody else changes: their memory is not
-    copied."""
-    return Pair(*(fields if is_traced(fields) else jax.device_put(fields)))
+    copied. Behind the eight of every pair stand those of `roots`, where there are
+    any."""
+    fields = fields if is_traced(fields) else jax.device_put(fields)
+    return Pair(*fields[:8], CofactorRoots(*fields[8:]) if fields[8:] else None)
 
 
 def double(one: PyTree) -> PyTree:
@@ -272,16 +314,18 @@ def _pad_fields(one: Pair, points: int, xp: ModuleType) -> list:
             f"pad: the pair has {one.x_left.shape[-1]} points, more than {points}"
         )
     shape = *one.x_left.shape[:-1], missing
-    places = lambda field, fill=0: xp.concatenate(
+    places = lambda field, fill=0.0: xp.concatenate(
         [field, xp.full(shape, fill, field.dtype)], axis=-1
     )
-    *coordinates, sigma, mask, left, right = jax.tree.leaves(one)
+    *coordinates, sigma, mask, left, right = jax.tree.leaves(one)[:8]
+    roots = () if one.roots is None else zip(one.roots, UNIT, strict=True)
     return [
         *map(places, coordinates),
         places(sigma, 1),
         places(mask),
         xp.array(left),
         xp.array(right),
+        *(places(root, fill) for root, fill in roots),
     ]
 
 
@@ -296,6 +340,8 @@ def stack(pairs: Sequence[Pair], points: int | None = None) -> Pair:
             "stack: single pairs are wanted, got a batch (pair, point): take it apart "
             "with unstack"
         )
+    if any(one.roots is not None for one in pairs):
+        pairs = [with_roots(one) for one in pairs]
     longest = max(one.x_left.shape[-1] for one in pairs) if points is None else points
     xp = _library(pairs)
     rows = [_pad_fields(one, longest, xp) for one in pairs]
@@ -328,6 +374,7 @@ def swapped(one: Pair) -> Pair:
         mask=one.mask,
         focal_left=one.focal_right,
         focal_right=one.focal_left,
+        roots=None if one.roots is None else one.roots.swapped(),
     )
 
 
@@ -344,7 +391,7 @@ def mask_unusable(one: Pair) -> tuple[Pair, Bool[Array, "*pairs"]]:
     """The pair with points that are not finite masked and zeroed, and whether anything
     had to be left out.
 
-    Masked points are set to zero coordinates and unit sigma whatever they held, so that
+    Masked points are set to zero coordinates and unit cofactors whatever they held, so that
     nothing they hold can reach a result or a derivative. What is out of all proportion
     (WIDEST, SCALE) counts as not finite: its squares would not be.
     """
@@ -352,16 +399,23 @@ def mask_unusable(one: Pair) -> tuple[Pair, Bool[Array, "*pairs"]]:
     focals = [one.focal_left, one.focal_right]
     focal_ok = [fair(f) for f in focals]
     finite = fair(one.sigma)
+    if one.roots is not None:
+        finite = finite & one.roots.fair
     for c, f in zip(
         one.coordinates, (focals[0], focals[0], focals[1], focals[1]), strict=True
     ):
         finite = finite & (jnp.abs(c) < WIDEST * jnp.minimum(f, SCALE)[..., None])
     use = one.mask & finite
     bad = (count(one.mask & ~finite) > 0) | ~focal_ok[0] | ~focal_ok[1]
+    roots = one.roots
+    if roots is not None:
+        fill = zip(roots, UNIT, strict=True)
+        roots = CofactorRoots(*(jnp.where(use, root, unit) for root, unit in fill))
     repaired = Pair(
         *(jnp.where(use, c, 0.0) for c in one.coordinates),
         jnp.where(use, one.sigma, 1.0),
         use,
         *(jnp.where(ok, f, 1.0) for ok, f in zip(focal_ok, focals, strict=True)),
+        roots,
     )
     return repaired, bad

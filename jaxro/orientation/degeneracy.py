@@ -140,9 +140,9 @@ def _sum_along(
 ) -> _Bent:
     """The sums for F and its derivatives along a direction."""
 
-    def of_point(point, sigma, use):
-        _, square, b = coplanarity.linearise(f, point, use)
-        g, drift, turned = coplanarity.linearise(slope, point, use)
+    def of_point(point, sigma, use, roots):
+        _, square, b = coplanarity.linearise(f, point, use, roots)
+        g, drift, turned = coplanarity.linearise(slope, point, use, roots)
         weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
         steepens = sum(x * y for x, y in zip(b, turned, strict=True)) / square
         bent = coplanarity.condition(curve, point) - 2 * g * steepens
@@ -150,7 +150,8 @@ def _sum_along(
         own = g**2 * weight, drift * sigma**2 * weight, bent**2 * weight
         return *own, *(bent * weight * entry for entry in by_f)
 
-    of_points = jax.vmap(of_point)(pair.coordinates, pair.sigma, pair.mask)
+    measured = pair.coordinates, pair.sigma, pair.mask, pair.roots
+    of_points = jax.vmap(of_point)(*measured)
     change, drift, bends, *products = sums(of_points)
     p11, p12, p13, p21, p22, p23, p31, p32, p33 = products
     by_entry = (p11, p12, p13), (p21, p22, p23), (p31, p32, p33)

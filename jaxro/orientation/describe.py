@@ -64,11 +64,11 @@ def describe(pair: Pair, problem: Problem, solution: Solution) -> Description:
     scale = problem.elements.scale((pose.bx, pose.by, pose.bz), length)
     meet = model_point(pair, pose, elements, scale, noise.size)
 
-    def of_point(point, sigma, use):
-        return jnp.where(use, parallax_of(point), 0.0), *meet(point, sigma, use)
+    def of_point(point, sigma, use, roots):
+        return jnp.where(use, parallax_of(point), 0.0), *meet(point, sigma, use, roots)
 
     parallax, model, in_front, behind = pointwise(
-        of_point, pair.coordinates, pair.sigma, pair.mask
+        of_point, pair.coordinates, pair.sigma, pair.mask, pair.roots
     )
     accurate = (behind & ~pair.coarse).astype(parallax.dtype)
     squares, behind = sums((parallax**2, accurate))

@@ -208,6 +208,5 @@ def _corrections_of(data: tuple[RelativePose, Pair]) -> Coordinates:
     f = coplanarity.fundamental_matrix(
         *pose.relative(), pair.focal_left, pair.focal_right
     )
-    return jax.vmap(lambda point, use: coplanarity.corrections(f, point, use))(
-        pair.coordinates, pair.mask
-    )
+    correct = lambda point, use, roots: coplanarity.corrections(f, point, use, roots)
+    return jax.vmap(correct)(pair.coordinates, pair.mask, pair.roots)

@@ -35,9 +35,15 @@ SMALLEST_VARIANCE = 1e-6
 
 
 def state_sigma(pair: Pair, sigma: float | None) -> Pair:
-    """The pair with this standard deviation of its coordinates; its own if None."""
+    """The pair with this standard deviation of its coordinates; its own if None. Raises
+    ValueError for a pair whose coordinates have covariances."""
     if sigma is None:
         return pair
+    if pair.roots is not None:
+        raise ValueError(
+            f"sigma = {sigma} is one standard deviation for all coordinates, but the "
+            "pair has covariances of its own: leave out the sigma of the procedure"
+        )
     return dataclasses.replace(pair, sigma=jnp.full_like(pair.sigma, sigma))
 
 

@@ -41,7 +41,7 @@ def adjust_parallaxes(
     """The converged solution for the points in use, from zero elements if no start is
     given."""
     return orient(
-        pair.with_sigma(1.0).with_mask(mask),
+        _equally_accurate(pair).with_mask(mask),
         elements=IndependentElements,
         residual=coplanarity.parallax,
         start=zero_elements(pair) if start is None else start,
@@ -70,8 +70,20 @@ def parallax_residuals(
     pair: Pair, mask: Bool[Array, "point"], elements: AbstractElements
 ) -> Residuals:
     """q of the points in use as a function of a displacement of the elements."""
-    term = coplanarity.parallax(pair.with_sigma(1.0).with_mask(mask))
+    term = coplanarity.parallax(_equally_accurate(pair).with_mask(mask))
     return Residuals(term, elements)
+
+
+def _equally_accurate(pair: Pair) -> Pair:
+    """The pair with unit weights, as in the papers. Raises ValueError for a pair whose
+    coordinates have covariances."""
+    if pair.roots is not None:
+        raise ValueError(
+            "this procedure adjusts y-parallaxes of unit weight and cannot use the "
+            "covariances of the pair: use `recommended` or `data-snooping`, or make the "
+            "pair without covariances"
+        )
+    return pair.with_sigma(1.0)
 
 
 def reject_once(

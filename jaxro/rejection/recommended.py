@@ -58,6 +58,8 @@ class Level(eqx.Module):
         """The factor of the standard deviations with which a search begins."""
         if self.known:
             return jnp.ones_like(pair.focal_left)
+        if pair.roots is not None:
+            return jnp.ones_like(pair.focal_left)
         stated = count(pair.mask & (pair.sigma != 1)) > 0
         return jnp.where(stated, 1.0, pair.focal_left / UNKNOWN)
 

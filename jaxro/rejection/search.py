@@ -31,6 +31,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry import coplanarity, rotations as rot
+from ..geometry.cofactor_roots import CofactorRoots
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
 from ..xla.kernels import if_needed, while_loop
@@ -111,12 +112,13 @@ def nothing_found(pose: RelativePose) -> Found:
 
 
 class Sample(NamedTuple):
-    """The points of a pair for a search: coordinates and sigma of those that take part,
-    before all others, and how many they are."""
+    """The points of a pair for a search: coordinates, sigma and roots of those that
+    take part, before all others, and how many they are."""
 
     rows: Float[Array, "point 4"]
     sigma: Float[Array, "point"]
     of: Float[Array, ""]
+    roots: CofactorRoots | None
 
     @property
     def has_neighbours(self) -> bool:
@@ -304,6 +306,7 @@ def _sample(pair: Pair) -> Sample:
         rows=move_up_coordinates(pair),
         sigma=move_up(pair, pair.sigma, fill=1.0),
         of=count(pair.mask),
+        roots=jax.tree.map(lambda a: move_up(pair, a, fill=1.0), pair.roots),
     )
 
 
@@ -357,14 +360,15 @@ def _compare(
 ) -> Comparison:
     """The cost of every orientation for points evenly taken of all, in single
     precision."""
-    points, sigma, there = _judges(sample, judges)
+    points, sigma, roots, there = _judges(sample, judges)
     bound = ((limit * sigma) ** 2).astype(jnp.float32)[:, None]
     fundamental = lambda pose: coplanarity.fundamental_matrix(
         *pose.relative(), pair.focal_left, pair.focal_right
     )
     matrices = in_single(jax.vmap(fundamental)(poses))
-    of_poses = jax.vmap(_square, (0, None, None))
-    r2 = jax.vmap(of_poses, (None, 0, 0))(matrices, points, there > 0)
+    of_poses = jax.vmap(_square, (0, None, None, None))
+    of_points = jax.vmap(of_poses, (None, 0, 0, 0))
+    r2 = of_points(matrices, points, there > 0, roots)
     weight = there[:, None]
     costs = _point_cost(r2 / bound * limit**2, limit)
     cost = jnp.sum(costs * weight, axis=0)
@@ -374,20 +378,27 @@ def _compare(
     return Comparison(cost=double(cost), agree=double(agree), asked=double(asked))
 
 
-def _square(f: tuple, point: Float[Array, "4"], use: Bool[Array, ""]) -> Array:
+def _square(
+    f: tuple,
+    point: Float[Array, "4"],
+    use: Bool[Array, ""],
+    roots: CofactorRoots | None,
+) -> Array:
     """r² of a point under the fundamental matrix F."""
-    g, variance, _ = coplanarity.linearise(f, tuple(point), use)
+    g, variance, _ = coplanarity.linearise(f, tuple(point), use, roots)
     return g * g / variance
 
 
-def _judges(sample: Sample, judges: int) -> tuple[Array, Array, Array]:
-    """Coordinates and sigma of points evenly taken of all, and 1 for those that
+def _judges(
+    sample: Sample, judges: int
+) -> tuple[Array, Array, CofactorRoots | None, Array]:
+    """Coordinates, sigma and roots of points evenly taken of all, and 1 for those that
     exist."""
     size = min(judges, sample.rows.shape[0])
     number = jnp.arange(size)
     exact = number.astype(sample.of.dtype)
     spread = jnp.floor(exact * (sample.of / size)).astype(int)
     place = jnp.where(sample.of > size, spread, number)
-    points = in_single(sample.rows.at[place].get(mode="clip"))
-    sigma = sample.sigma.at[place].get(mode="clip")
-    return points, sigma, (exact < sample.of).astype(jnp.float32)
+    taken = lambda a: a.at[place].get(mode="clip")
+    points, roots = in_single(jax.tree.map(taken, (sample.rows, sample.roots)))
+    return points, taken(sample.sigma), roots, (exact < sample.of).astype(jnp.float32)

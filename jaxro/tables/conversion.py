@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.csv as arrow_csv
 
 from . import csv as tables, whole
-from .measured import COLUMNS, NUMBERS, PHOTOS
+from .measured import COLUMNS, COVARIANCES, DEVIATIONS, PHOTOS, check_accuracy
 from .parquet import BATCH, NAMES, encoding, pa, pc, pq
 
 
@@ -43,6 +43,7 @@ def _convert_quickly(source: Path, draft: Path, semicolons: bool) -> None:
     if not header or _odd(source, separator):
         raise pa.ArrowInvalid("for the careful reader")
     COLUMNS.places(header, str(source), line)
+    check_accuracy([COLUMNS.full(name) for name in header], str(source))
     full = [COLUMNS.full(name) for name in header]
     if set(PHOTOS) & set(full):
         raise pa.ArrowInvalid("for the careful reader")
@@ -77,14 +78,14 @@ def _convert_carefully(source: Path, draft: Path, semicolons: bool) -> None:
     """Line by line, a tenth as fast. Raises TableError."""
     lines, writer = tables.lines(source, semicolons), None
     while rows := list(islice(lines, BATCH)):
-        _, pairs, points, values, photos = zip(*rows, strict=True)
+        _, pairs, points, values, photos, names = zip(*rows, strict=True)
         columns = {"pair": pairs} if pairs[0] else {}
         if photos[0]:
             columns |= dict(zip(PHOTOS, zip(*photos, strict=True), strict=True))
         batch = pa.table(
             columns
             | {"point": points}
-            | dict(zip(NUMBERS, zip(*values, strict=True), strict=False))
+            | dict(zip(names[0], zip(*values, strict=True), strict=True))
         )
         writer = writer or pq.ParquetWriter(
             draft, batch.schema, **encoding(batch.schema)
@@ -121,6 +122,11 @@ def _check(batch: Any) -> None:
             if any(not text.strip() for text in column.unique().to_pylist()):
                 raise pa.ArrowInvalid(f"an empty field in column {name}")
         elif not np.all(np.isfinite(values := column.to_numpy())) or (
-            name == "sigma" and not np.all(values > 0)
+            name in ("sigma", *DEVIATIONS) and not np.all(values > 0)
         ):
             raise pa.ArrowInvalid(f"a number that cannot be used in column {name}")
+    for side, name in enumerate(COVARIANCES):
+        if name in batch.schema.names:
+            x, y = (batch.column(n).to_numpy() for n in DEVIATIONS[2 * side :][:2])
+            if not np.all(np.abs(batch.column(name).to_numpy()) < x * y):
+                raise pa.ArrowInvalid(f"a number that cannot be used in column {name}")

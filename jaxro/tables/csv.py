@@ -3,8 +3,10 @@ clear error.
 
 Columns, in any order: point, x_left, y_left, x_right, y_right and optionally pair, left
 and right (the names of the photos), sigma; `id,xl,yl,xr,yr` is the short form of the
-first five. Coordinates and sigma are
-in the units of the measurement; cameras turn them into photo coordinates. Nothing is
+first five. In place of sigma there may be a standard deviation for each coordinate,
+sigma_x_left, sigma_y_left, sigma_x_right, sigma_y_right, and the covariances of x and y
+in each photo, cov_xy_left and cov_xy_right. All are in the units of the measurement
+(covariances in their square); cameras turn them into photo coordinates. Nothing is
 skipped or guessed: whatever does not fit stops the reading with file, line and column.
 """
 
@@ -15,18 +17,30 @@ from typing import NamedTuple
 
 from . import fields
 from .fields import TableError, read_text
-from .measured import COLUMNS, NUMBERS, PHOTOS, Measurements, Table, of_pairs
+from .measured import (
+    COLUMNS,
+    COVARIANCES,
+    DEVIATIONS,
+    NUMBERS,
+    PHOTOS,
+    Measurements,
+    Table,
+    check_accuracy,
+    of_pairs,
+)
 
 
 class Line(NamedTuple):
     """One line of a table: its number, pair, point, the numbers of `NUMBERS` that the
-    table has, and the photos of the pair, () where it has none."""
+    table has, the photos of the pair, () where it has none, and the names of the
+    numbers."""
 
     number: int
     pair: str
     point: str
     values: tuple[float, ...]
     photos: tuple[str, ...]
+    columns: tuple[str, ...]
 
 
 def read(path: Path, semicolons: bool = False) -> Table:
@@ -43,7 +57,7 @@ def parse(text: str, file: str, name: str, semicolons: bool = False) -> Table:
     seen: dict[str, dict[str, int]] = {}
     places: dict[tuple, str] = {}
     twins: dict[str, list[str]] = {}
-    for line, pair, point, values, photos in check_lines(
+    for line, pair, point, values, photos, columns in check_lines(
         io.StringIO(text, newline=""), file, name, semicolons
     ):
         first = seen.setdefault(pair, {}).setdefault(point, line)
@@ -59,7 +73,8 @@ def parse(text: str, file: str, name: str, semicolons: bool = False) -> Table:
         twin = places.setdefault((pair, *values[:4]), point)
         if twin != point:
             twins.setdefault(pair, []).append(f"{point} = {twin} (line {line})")
-        measured = pairs.setdefault(pair, Measurements(pair, photos=photos))
+        new = Measurements(pair, photos=photos, numbers=columns)
+        measured = pairs.setdefault(pair, new)
         if measured.photos != photos:
             raise TableError(
                 file,
@@ -103,15 +118,19 @@ def check_lines(
 ) -> Iterator[Line]:
     """Every line below the header, each field looked at; `name`: of the pair, where the
     table has neither a column for it nor for its photos. Raises TableError."""
+    columns: tuple[str, ...] = ()
     for line, cells in fields.lines_of(text, file, COLUMNS, semicolons):
+        if not columns:
+            check_accuracy(tuple(cells), file)
+            columns = tuple(name for name in NUMBERS if name in cells)
         point = fields.name(cells["point"], file, line, "point")
         photos = _photos(cells, file, line)
         pair = "-".join(photos) or name
         if "pair" in cells:
             pair = fields.name(cells["pair"], file, line, "pair")
-        numbers = (c for c in NUMBERS if c in cells)
-        values = tuple(_number(cells[c], file, line, c) for c in numbers)
-        yield Line(line, pair, point, values, photos)
+        values = tuple(_number(cells[c], file, line, c) for c in columns)
+        _check_covariances(dict(zip(columns, values, strict=True)), file, line)
+        yield Line(line, pair, point, values, photos, columns)
 
 
 def _photos(cells: dict[str, str], file: str, line: int) -> tuple[str, ...]:
@@ -151,11 +170,11 @@ def _twins(file: str, pair: str, found: list[str]) -> str:
 
 
 def _number(text: str, file: str, line: int, column: str) -> float:
-    """A finite number; positive for sigma."""
+    """A finite number; positive for a standard deviation."""
     value = fields.number(
         text, file, line, column, "; delete the line to leave the point out"
     )
-    if column == "sigma" and value <= 0:
+    if column in ("sigma", *DEVIATIONS) and value <= 0:
         raise TableError(
             file,
             line=line,
@@ -164,3 +183,19 @@ def _number(text: str, file: str, line: int, column: str) -> float:
             expected="a positive standard deviation in the unit of the coordinates",
         )
     return value
+
+
+def _check_covariances(values: dict[str, float], file: str, line: int) -> None:
+    """Raises TableError for a covariance that the two standard deviations rule out."""
+    for side, column in enumerate(COVARIANCES):
+        if column in values:
+            x, y = (values[name] for name in DEVIATIONS[2 * side :][:2])
+            if abs(values[column]) >= x * y:
+                raise TableError(
+                    file,
+                    line=line,
+                    column=column,
+                    found=f"{values[column]:g}",
+                    expected="a covariance that is smaller in size than the product of "
+                    f"the two standard deviations, {x * y:g}",
+                )

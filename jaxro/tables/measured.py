@@ -14,21 +14,28 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..batches.ragged import Ragged
+from ..geometry.cofactor_roots import covariances_of, from_covariances
 from ..geometry.pairs import Camera, Pair
-from .fields import Columns
+from .fields import Columns, TableError
 
 COORDINATES = ("x_left", "y_left", "x_right", "y_right")
 
 PHOTOS = ("left", "right")
 """Columns with the names of the photos of a pair."""
 
+DEVIATIONS = tuple(f"sigma_{name}" for name in COORDINATES)
+"""Columns with a standard deviation for each coordinate, in place of sigma."""
+
+COVARIANCES = ("cov_xy_left", "cov_xy_right")
+"""Columns with the covariances of x and y of a photo, beside the deviations."""
+
 COLUMNS = Columns(
     ("point", *COORDINATES),
-    ("pair", *PHOTOS, "sigma"),
+    ("pair", *PHOTOS, "sigma", *DEVIATIONS, *COVARIANCES),
     {"id": "point", "xl": "x_left", "yl": "y_left", "xr": "x_right", "yr": "y_right"},
     texts=("pair", "point", *PHOTOS),
 )
-NUMBERS = (*COORDINATES, "sigma")
+NUMBERS = (*COORDINATES, "sigma", *DEVIATIONS, *COVARIANCES)
 
 CameraPairs = tuple[Camera, Camera] | list[tuple[Camera, Camera]]
 """(left, right) of all pairs, or of each."""
@@ -37,13 +44,15 @@ CameraPairs = tuple[Camera, Camera] | list[tuple[Camera, Camera]]
 @dataclass
 class Measurements:
     """The measured points of one pair; `lines` are their lines in the file. `photos`:
-    the names of the left and the right one, () where the table has none."""
+    the names of the left and the right one, () where the table has none. `numbers`: the
+    names of the columns of the rows."""
 
     name: str
     points: list[str] = field(default_factory=list)
     rows: list[tuple[float, ...]] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
     photos: tuple[str, ...] = ()
+    numbers: tuple[str, ...] = NUMBERS[:5]
 
     @property
     def coordinates(self) -> Float[np.ndarray, "4 point"]:
@@ -54,7 +63,8 @@ class Measurements:
     def sigma(self) -> Float[np.ndarray, " point"] | None:
         """Standard deviations of the coordinates, where the table has them."""
         rows = np.asarray(self.rows, np.float64)
-        return rows[:, 4] if rows.shape[1] == 5 else None
+        there = "sigma" in self.numbers and rows.shape[1] > 4
+        return rows[:, 4] if there else None
 
 
 @dataclass(frozen=True)
@@ -65,7 +75,8 @@ class Table:
     `names` of the pairs; `points` and `numbers` of the rows, by the names of `NUMBERS`;
     `lines` of the rows in CSV text; `photos`: the names of the left and of the right
     photo of each pair, where the table has them; `warnings`: what a careful reader
-    should be told.
+    should be told. `relative`: only the ratios of the standard deviations in `numbers`
+    are known, which then are those for a sigma of 1.
     """
 
     file: str
@@ -76,11 +87,18 @@ class Table:
     lines: Int[np.ndarray, " row"] | None = None
     photos: tuple[Any, Any] | None = None
     warnings: tuple[str, ...] = ()
+    relative: bool = False
 
     @property
     def has_sigma(self) -> bool:
-        """Whether the table has a column sigma."""
-        return "sigma" in self.numbers
+        """Whether the table tells the standard deviations of the coordinates."""
+        there = "sigma" in self.numbers or self.has_covariances
+        return there and not self.relative
+
+    @property
+    def has_covariances(self) -> bool:
+        """Whether the table has the columns DEVIATIONS."""
+        return DEVIATIONS[0] in self.numbers
 
     @property
     def lengths(self) -> Int[np.ndarray, " pair"]:
@@ -91,6 +109,25 @@ class Table:
     def owners(self) -> Int[np.ndarray, " row"]:
         """The number of the pair of every row."""
         return np.repeat(np.arange(len(self.begins) - 1), self.lengths)
+
+    def with_one_sigma(self) -> "Table":
+        """The table with one standard deviation for each point, for what cannot use
+        more: the root of the mean of its variances. Adds a warning."""
+        if not self.has_covariances:
+            return self
+        squares = [_floats(self.numbers[name]) ** 2 for name in DEVIATIONS]
+        sigma = np.sqrt(np.mean(squares, axis=0))
+        most = float(np.nanmax(np.sqrt(np.max(squares, axis=0)) / sigma))
+        others = {n: c for n, c in self.numbers.items() if n in COORDINATES}
+        warning = (
+            f"{self.file}: each point is used with one standard deviation, the mean of "
+            f"its coordinates; that of a single coordinate is up to {most:.3g} times it."
+        )
+        return replace(
+            self,
+            numbers=others | {"sigma": sigma},
+            warnings=(*self.warnings, warning),
+        )
 
     def first_line(self, number: int) -> int | None:
         """The line of the first point of a pair, in CSV text."""
@@ -104,7 +141,13 @@ class Table:
         lines = [] if self.lines is None else self.lines.tolist()
         spans = zip(self.begins[:-1].tolist(), self.begins[1:].tolist(), strict=True)
         return [
-            Measurements(str(name), points[a:b], rows[a:b], lines[a:b])
+            Measurements(
+                str(name),
+                points[a:b],
+                rows[a:b],
+                lines[a:b],
+                numbers=tuple(self.numbers),
+            )
             for name, (a, b) in zip(self.names.tolist(), spans, strict=True)
         ]
 
@@ -135,6 +178,7 @@ def of_pairs(
 ) -> Table:
     """Pairs one by one as columns."""
     rows = np.array([row for pair in pairs for row in pair.rows], np.float64)
+    names = pairs[0].numbers if pairs else NUMBERS
     photos = None
     if pairs and pairs[0].photos:
         left, right = zip(*(pair.photos for pair in pairs), strict=True)
@@ -144,7 +188,7 @@ def of_pairs(
         names=np.array([pair.name for pair in pairs], object),
         begins=np.cumsum([0] + [len(pair.points) for pair in pairs]),
         points=np.array([point for pair in pairs for point in pair.points], object),
-        numbers=dict(zip(NUMBERS, rows.T.copy(), strict=False)),
+        numbers=dict(zip(names, rows.T.copy(), strict=False)),
         lines=np.array([line for pair in pairs for line in pair.lines], int),
         photos=photos,
         warnings=tuple(warnings),
@@ -155,7 +199,8 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
     """The points in photo coordinates, by the arithmetic of `Camera.to_photo`.
 
     `sigma`: standard deviation of all coordinates in the unit of the table, where the
-    table has no column of it; without both it is 1. Missing numbers are NaN.
+    table has no column of it; without both it is 1. Where the table has relative ones
+    they are multiplied by it. Missing numbers are NaN.
     """
     count, pairs = len(table.points), len(table.begins) - 1
 
@@ -168,22 +213,29 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
 
     photo = []
     for side, (u, v) in enumerate((COORDINATES[:2], COORDINATES[2:])):
-        size = constant(side, lambda c: c.pixel_size)
-        sign = constant(side, lambda c: -1.0 if c.y_down else 1.0)
+        size, sign = constant(side, _size), constant(side, _sign)
         x0 = constant(side, lambda c: c.principal_point[0])
         y0 = constant(side, lambda c: c.principal_point[1])
         photo += [
             (_floats(table.numbers[u]) - x0) * size,
             (_floats(table.numbers[v]) - y0) * (sign * size),
         ]
-    deviation = np.ones(count)
-    if table.has_sigma or sigma is not None:
+    deviation, roots = np.ones(count), None
+    unit = 1.0 if sigma is None or not table.relative else sigma
+    if table.has_covariances:
+        both = [
+            _covariances(table, side, *(constant(side, f) for f in (_size, _sign)))
+            for side in (0, 1)
+        ]
+        deviation, roots = from_covariances(*both)
+        deviation = deviation * unit
+    elif "sigma" in table.numbers or sigma is not None:
         given = (
-            _floats(table.numbers["sigma"])
-            if table.has_sigma
+            _floats(table.numbers["sigma"]) * unit
+            if "sigma" in table.numbers
             else np.full(count, sigma, float)
         )
-        deviation = given * constant(0, lambda c: c.pixel_size)
+        deviation = given * constant(0, _size)
     each = [cameras] * pairs if isinstance(cameras, tuple) else cameras
     focal_left, focal_right = np.array(
         [(left.focal, right.focal) for left, right in each], np.float64
@@ -198,14 +250,56 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
         mask=np.ones(count, bool),
         focal_left=focal_left,
         focal_right=focal_right,
+        roots=roots,
     )
+
+
+def _size(camera: Camera) -> float:
+    """The size of a pixel."""
+    return camera.pixel_size
+
+
+def _sign(camera: Camera) -> float:
+    """-1 where rows count downwards."""
+    return -1.0 if camera.y_down else 1.0
+
+
+def _covariances(
+    table: Table, side: int, size: Any, sign: Any
+) -> Float[np.ndarray, "row 2 2"]:
+    """The covariance matrices of (x, y) in the photos of one side, in photo units."""
+    x, y = (_floats(table.numbers[n]) * size for n in DEVIATIONS[2 * side :][:2])
+    xy = np.zeros(len(x))
+    if COVARIANCES[side] in table.numbers:
+        xy = _floats(table.numbers[COVARIANCES[side]]) * (sign * size**2)
+    return covariances_of(x, y, xy)
+
+
+def check_accuracy(columns: Sequence[str], file: str, line: int | None = None) -> None:
+    """Raises TableError where the columns that tell the accuracy of the coordinates do
+    not go together."""
+    there = [name for name in DEVIATIONS if name in columns]
+    covariances = [name for name in COVARIANCES if name in columns]
+    if not there and not covariances:
+        return
+    expected = f"sigma, or all of {', '.join(DEVIATIONS)}"
+    if "sigma" in columns:
+        found = "it beside the column sigma"
+    elif len(there) < len(DEVIATIONS):
+        missing = next(name for name in DEVIATIONS if name not in columns)
+        found = f"it without {missing}"
+    else:
+        return
+    column = (there or covariances)[0]
+    raise TableError(file, line=line, column=column, found=found, expected=expected)
 
 
 def one_pair(pairs: Ragged, number: int) -> Pair:
     """A pair of `pairs`, not padded, as JAX arrays."""
     rows = slice(int(pairs.begins[number]), int(pairs.begins[number + 1]))
-    of_points = [column[rows] for column in pairs[1:7]]
-    return Pair(*jax.device_put([*of_points, *(f[number] for f in pairs[7:])]))
+    of_points, roots = jax.tree.map(lambda a: a[rows], (pairs[1:7], pairs.roots))
+    focals = pairs.focal_left[number], pairs.focal_right[number]
+    return Pair(*jax.device_put([*of_points, *focals, roots]))
 
 
 def _floats(column: Any) -> Float[np.ndarray, " row"]:

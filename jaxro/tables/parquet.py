@@ -15,7 +15,7 @@ from jaxtyping import Int
 
 from . import csv as tables
 from .fields import TableError
-from .measured import COLUMNS, NUMBERS, PHOTOS, Table
+from .measured import COLUMNS, DEVIATIONS, NUMBERS, PHOTOS, Table, check_accuracy
 
 try:
     import pyarrow as pa
@@ -72,8 +72,13 @@ class Source:
 
     @property
     def has_sigma(self) -> bool:
-        """Whether the table has a column sigma."""
-        return "sigma" in self.columns
+        """Whether the table tells the standard deviations of the coordinates."""
+        return "sigma" in self.columns or self.has_covariances
+
+    @property
+    def has_covariances(self) -> bool:
+        """Whether the table has a standard deviation for each coordinate."""
+        return DEVIATIONS[0] in self.columns
 
     @property
     def count(self) -> int:
@@ -251,6 +256,7 @@ def _columns(path: Path, schema: Any) -> dict[str, str]:
     """The columns in the table by their full names. Raises TableError for missing,
     unknown or unsuitable ones."""
     places = COLUMNS.places(schema.names, str(path), None)
+    check_accuracy(tuple(places), str(path))
     for full, place in places.items():
         field = schema.field(place)
         named = full in NAMES

@@ -56,6 +56,12 @@ def silent(done: int, total: int) -> None:
     """A progress callback that does nothing."""
 
 
+def has_caches() -> bool:
+    """Whether the device works fastest on few numbers that stay in a cache, as a CPU
+    does; others want as many at once as their memory holds."""
+    return jax.default_backend() == "cpu"
+
+
 def spread(
     data: PyTree, run: Program, split: Split, chunk: int, report: Progress = silent
 ) -> PyTree:

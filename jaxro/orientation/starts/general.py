@@ -143,14 +143,16 @@ def _spread(pair: Pair, count: int) -> Pair:
     rank = jnp.where(total > count, rank * total // count, rank)
     use = rank < total
     place = jnp.searchsorted(number, rank + 1)
-    *fields, _, left, right = jax.tree.leaves(pair)
-    *coordinates, sigma = (field.at[place].get(mode="clip") for field in fields)
+    of_points = *pair.coordinates, pair.sigma, pair.roots
+    chosen = jax.tree.map(lambda a: a.at[place].get(mode="clip"), of_points)
+    *coordinates, sigma, roots = chosen
     return Pair(
         *(jnp.where(use, c, 0.0) for c in coordinates),
         jnp.where(use, sigma, 1.0),
         use,
-        left,
-        right,
+        pair.focal_left,
+        pair.focal_right,
+        roots,
     )
 
 
