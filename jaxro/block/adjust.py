@@ -311,9 +311,9 @@ def adjust_block(
 
     `inner`: the inner parameters of the cameras that are unknown, too; `left_out`: rays
     that take no part, but keep their numbers; `bars`: known distances. Without known
-    coordinates the network is free: its datum is that of the approximate stations
-    (inner constraints). Points on one photo, of which nothing else is known, are left
-    out. Failures are values of `adjustment.result`.
+    coordinates the network is free: its datum is that of the approximate photos (inner
+    constraints on their places and turns). Points on one photo, of which nothing else
+    is known, are left out. Failures are values of `adjustment.result`.
     """
     prepared = prepare_block(block, start, ground, inner, left_out, bars)
     return conclude(prepared, minimise(prepared.problem, datum=prepared.datum))
@@ -356,6 +356,10 @@ def prepare_block(
         lengths = bars.length / units.length, bars.sigma / units.length
         terms = *terms, *bar_terms(between, *lengths, spread)
     problem = prepare(terms, families, eliminate="point", linked="photo")
+    datum = None
+    if not parts:
+        distance = _distance(block, numbered, inside, points)
+        datum = free_datum(stations, distance, has_scale=bars is not None)
     return Prepared(
         block=block,
         ground=ground,
@@ -365,8 +369,21 @@ def prepare_block(
         inner=inner,
         bars=bars,
         problem=problem,
-        datum=None if parts else free_datum(stations, has_scale=bars is not None),
+        datum=datum,
     )
+
+
+def _distance(
+    block: MeasuredBlock,
+    numbered: Numbered,
+    centres: Float[np.ndarray, "photo 3"],
+    points: Float[np.ndarray, "some 3"],
+) -> float:
+    """The median distance from photos to the points that they show."""
+    used = numbered.rays
+    shown = points[numbered.number[block.point[used]]]
+    apart = shown - centres[block.photo[used]]
+    return float(np.median(np.linalg.norm(apart, axis=1)))
 
 
 def _bars_in(

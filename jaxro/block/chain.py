@@ -3,7 +3,8 @@
 Each pair is a model of its own scale. Two pairs that share a photo have the ratio of
 scales that the depths of their common points in this photo tell: only points on three
 photos carry scale. The most certain ratios join the pairs, and the most certain pairs
-the photos (minimum spanning trees). Nothing is adjusted.
+the photos (minimum spanning trees). A pair whose rotation closes no triangle of photos
+is as uncertain as what is missing. Nothing is adjusted.
 """
 
 from collections.abc import Iterator
@@ -109,7 +110,11 @@ def chain(block: MeasuredBlock, models: Models) -> Chained:
     pairs, photos = len(models.left), len(block.photos)
     if pairs == 0:
         raise Unjoined(list(block.photos))
+    missing = least_closures(models, photos)
+    models = models._replace(deviation=np.hypot(models.deviation, missing))
     one, other, ratio, spread = _ratios(models, _common(block, models))
+    # an error of a rotation changes all depths of its pair alike
+    spread = np.hypot(spread, np.hypot(models.deviation[one], models.deviation[other]))
     joined = coo_array((spread, (one, other)), (pairs, pairs)).tocsr()
     tree = minimum_spanning_tree(joined)
     scale = np.full(pairs, np.nan)
@@ -129,6 +134,33 @@ def chain(block: MeasuredBlock, models: Models) -> Chained:
         shown = {*models.left[own], *models.right[own]} if len(own) else set()
         raise Unjoined([n for k, n in enumerate(block.photos) if k not in shown])
     return _poses(models, scale, best[1], photos)
+
+
+def least_closures(models: Models, photos: int) -> Float[np.ndarray, " pair"]:
+    """By which angle the best triangle of photos with each pair does not close,
+    D_ij D_jk = D_ik; 0 for pairs in no triangle. Right pairs close at least one triangle
+    to their errors, if two other right pairs belong to it; a wrong one closes none."""
+    first = np.minimum(models.left, models.right)
+    second = np.maximum(models.left, models.right)
+    turned = (models.left > models.right)[:, None, None]
+    of = np.where(turned, np.swapaxes(models.rotation, 1, 2), models.rotation)
+    key = first * photos + second
+    order = np.lexsort((models.deviation, key))
+    keys, begin, least = key[order], first[order], np.full(len(key), np.inf)
+    for lag in range(1, len(key)):
+        same = np.flatnonzero(begin[lag:] == begin[:-lag])
+        if len(same) == 0:
+            break
+        near, far = order[same], order[same + lag]
+        wanted = second[near] * photos + second[far]
+        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        there = keys[at] == wanted
+        near, far, across = near[there], far[there], order[at[there]]
+        apart = of[near] @ of[across] - of[far]
+        angle = np.sqrt(np.sum(apart**2, axis=(1, 2)) / 2)
+        for pair in (near, far, across):
+            np.minimum.at(least, pair, angle)
+    return np.where(np.isfinite(least), least, 0.0)
 
 
 def _poses(

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from ..adjustment import RESULTS
 from ..batches.ragged import Ragged, clean_ragged
 from ..rejection import Recommended, Rejection
 from .adjust import BlockAdjustment
@@ -105,7 +106,7 @@ def _adjust(
     """The adjustment without what is wrong, and its variance components; with them, if
     they are asked for, what is wrong is looked for once more."""
     adjusted, wrong = adjust_without_wrong(block, start, ground, inner, bars, level)
-    if not components:
+    if not components or adjusted.result != RESULTS.successful:
         return adjusted, wrong, components_of(adjusted)
     known = None
     if ground is not None:

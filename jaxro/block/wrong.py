@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..adjustment import critical_values
+from ..adjustment import RESULTS, critical_values
 from ..adjustment.sparse import Minimum, Problem, minimise, residuals_of
-from .adjust import BlockAdjustment, Prepared, adjust_block, prepare_block
+from .adjust import BlockAdjustment, Prepared, adjust_block, conclude, prepare_block
 from .bars import Bars
 from .inner import Inner
 from .measured_block import Ground, MeasuredBlock
@@ -47,6 +47,9 @@ NEARLY_RIGHT, FEW = 2.0, 6
 
 DATUM = 7
 """Known coordinates that a block needs."""
+
+MOST = 0.5
+"""Part of the rays that a robust solution may leave out: with more it is none."""
 
 UNCHECKED = 0.02
 """Redundancy below which nothing checks a coordinate: it is told, not tested."""
@@ -82,8 +85,9 @@ def adjust_without_wrong(
     level: float = 0.05,
 ) -> tuple[BlockAdjustment, Wrong]:
     """Adjust a block without its wrong rays and known coordinates. `inner`: the inner
-    parameters that are unknown; `bars`: known distances. Raises `TooLittleControl`
-    where hardly a known coordinate fits the photos."""
+    parameters that are unknown; `bars`: known distances. Where the rays fit no block
+    the adjustment says that it diverged. Raises `TooLittleControl` where hardly a known
+    coordinate fits the photos."""
     nothing = Wrong(
         np.zeros(len(block.photo), bool), np.zeros((_control_points(ground), 3), bool)
     )
@@ -95,6 +99,9 @@ def adjust_without_wrong(
     prepared = prepare_block(block, start, ground, inner, bars=bars)
     found = settle(prepared)
     wrong = _far(prepared, found)
+    if np.mean(wrong.rays[prepared.numbered.rays]) > MOST:
+        lost = found._replace(result=RESULTS.diverged)
+        return conclude(prepared, lost), nothing
     begin = prepared.start_at(found)
     adjusted = adjust_rest(block, begin, ground, wrong, inner, bars)
     adjusted, wrong = _test(adjusted, ground, wrong, level)
@@ -194,8 +201,11 @@ def normalise_residuals(adjusted: BlockAdjustment, level: float = 0.05) -> Teste
 def settle(prepared: Prepared) -> Minimum:
     """The minimum of the robust estimators, one after the other, from afar."""
     problem, datum = prepared.problem, prepared.datum
-    found = minimise(problem, datum=datum, max_steps=3)
+    # plain steps mend the bends of a long strip, and wrong places throw a short one off
+    plain = problem.at(minimise(problem, datum=datum, max_steps=3).problem)
+    problem = min(problem, plain, key=_absolute_sum)
     scales = [np.inf] * len(problem.data.terms)
+    found = Minimum(problem, 0, RESULTS.successful)
     for k in range(ABSOLUTE + ROUNDS):
         problem = problem.at(found.problem)
         sizes = _sizes(problem)
@@ -213,6 +223,11 @@ def _sizes(problem: Problem) -> list[Float[np.ndarray, " _"]]:
     """The residual of each group, in standard deviations of one coordinate."""
     sizes = lambda r: np.sqrt(np.mean(r**2, axis=1))
     return [sizes(r) for r in residuals_of(problem)]
+
+
+def _absolute_sum(problem: Problem) -> float:
+    """The sum of all absolute residuals."""
+    return sum(float(np.sum(sizes)) for sizes in _sizes(problem))
 
 
 def _scale(sizes: Float[np.ndarray, " group"], before: float) -> float:

@@ -1,0 +1,120 @@
+"""The datum of a free network: a pseudo-inverse in NumPy, laws, and strips that centres
+alone would hardly hold."""
+
+import numpy as np
+import pytest
+from oracles_block import dense_slopes, find_rays, rotations_of, with_wrong_rays
+
+from jaxro import block
+from jaxro.adjustment import RESULTS
+from jaxro.block.adjust import adjust_block
+from jaxro.block.orient_block import orient_block, start_from
+
+
+def adjust_freely(strips, models, seed=1):
+    """A free network, and its start."""
+    mock = block.mock_block(seed, block.Flight(strips=strips, models=models))
+    start = start_from(mock.block, mock.photos)
+    return adjust_block(mock.block, start).check(), start
+
+
+def distance_of(found):
+    """From photos to the points that they show, the median."""
+    used = found.numbered.rays
+    apart = found.coordinates[found.block.point] - found.centres[found.block.photo]
+    return np.median(np.linalg.norm(apart[used], axis=1))
+
+
+@pytest.mark.parametrize(("strips", "models"), [(1, 4), (2, 3)])
+def test_its_cofactors_are_the_pseudo_inverse_of_least_variance(strips, models):
+    """P N⁺ Pᵀ with P = 1 - G (Gᵀ W G)⁻¹ Gᵀ W, G all vectors that N takes to zero, W the
+    weights of turns and shifts of photos, zero for points."""
+    first, _ = adjust_freely(strips, models)
+    found = adjust_block(first.block, first.as_start).check()
+    a, photos = dense_slopes(found), len(found.block.photos)
+    # columns of one size: an angle, or a shift over the distance
+    unit = np.full(a.shape[1], distance_of(found))
+    unit[: 6 * photos].reshape(photos, 6)[:, :3] = 1.0
+    values, vectors = np.linalg.eigh((a * unit).T @ (a * unit))
+    assert values[6] < 1e-6 * values[7]
+    g, rest = vectors[:, :7], vectors[:, 7:]
+    pseudo = rest / values[7:] @ rest.T
+    weighted = g.T * (np.arange(len(unit)) < 6 * photos)
+    p = np.eye(len(unit)) - g @ np.linalg.solve(weighted @ g, weighted)
+    q = p @ pseudo @ p.T * np.outer(unit, unit)
+    own = [q[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(photos)]
+    length = np.array([1.0] * 3 + [found.frame.length] * 3)
+    cofactors = found.adjustment.cofactors["photo"] * np.outer(length, length)
+    spread = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    both = spread[:, :, None] * spread[:, None]
+    np.testing.assert_allclose(cofactors / both, own / both, atol=1e-5)
+    seen = found.numbered.number >= 0
+    of_points = np.sqrt(np.diagonal(q)[6 * photos :].reshape(-1, 3))
+    deviations = found.sigma0 * of_points
+    np.testing.assert_allclose(found.deviations[seen], deviations, rtol=1e-5)
+
+
+def test_photos_stay_as_a_whole_where_they_began():
+    """Neither their centres nor their turns shift, turn or scale as a whole."""
+    found, start = adjust_freely(1, 4)
+    moved = found.centres - start.centres
+    about = start.centres - start.centres.mean(axis=0)
+    largest = np.max(np.abs(moved))
+    assert largest > 0.01
+    np.testing.assert_allclose(moved.sum(axis=0), 0, atol=1e-7 * largest)
+    assert abs(np.sum(about * moved)) < 1e-7 * np.sum(np.abs(about * moved))
+    quaternions = start.quaternions, np.asarray(found.stations.quaternion)
+    before, after = (rotations_of(each) for each in quaternions)
+    m = np.swapaxes(before, 1, 2) @ after
+    of = lambda i, j: (m[:, i, j] - m[:, j, i]) / 2
+    turned = np.stack([of(1, 2), of(2, 0), of(0, 1)], axis=1)
+    assert np.max(np.abs(turned)) > 1e-6
+    distance = distance_of(found)
+    whole = np.cross(about, moved) + distance**2 * turned
+    assert np.all(np.abs(whole.sum(axis=0)) < 1e-5 * np.abs(whole).sum())
+
+
+def test_no_datum_changes_what_the_network_says_of_itself():
+    """From two starts, one turned, shifted, of another scale and rough: residuals,
+    sigma0, redundancy, and ratios of distances with their deviations."""
+    from scipy.spatial.transform import Rotation
+
+    found, start = adjust_freely(1, 4)
+    rng = np.random.default_rng(2)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    noise = lambda a, size: a + rng.normal(0, size, a.shape)
+    away = lambda a: 100 + 1.7 * turn.apply(a)
+    x, y, z, w = start.quaternions[:, [1, 2, 3, 0]].T
+    turned = Rotation.from_quat(np.stack([x, y, z, w], axis=1)) * turn.inv()
+    rough = turned * Rotation.from_rotvec(rng.normal(0, 0.003, (len(x), 3)))
+    x, y, z, w = rough.as_quat().T
+    other = start._replace(
+        quaternions=np.stack([w, x, y, z], axis=1),
+        centres=noise(away(start.centres), 5.0),
+        points=away(start.points),
+    )
+    second = adjust_block(found.block, other).check()
+    np.testing.assert_allclose(second.sigma0, found.sigma0, rtol=1e-8)
+    np.testing.assert_allclose(second.residuals, found.residuals, atol=1e-8)
+    np.testing.assert_allclose(second.redundancy, found.redundancy, atol=1e-6)
+    names = found.block.points[5:25:5]
+    for a, b, c, d in (names, names[::-1]):
+        one, two = (
+            [block.difference(each, *pair) for pair in ((a, b), (c, d), (b, c))]
+            for each in (found, second)
+        )
+        ratio = lambda three: three[0].distance / three[1].distance
+        np.testing.assert_allclose(ratio(two), ratio(one), rtol=1e-7)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_short_strip_with_wrong_ties_comes_to_rest(seed):
+    """Four models, from their pairs, without anything known of the ground: centres
+    alone do not see such a strip roll."""
+    mock = block.mock_block(seed, block.Flight(models=4))
+    measured, bad = with_wrong_rays(mock, seed, 0.2)
+    oriented = orient_block(*block.pairs_of(measured, seed))
+    found = oriented.adjusted.check()
+    assert found.adjustment.result == RESULTS.successful and oriented.wrong.settled
+    assert found.adjustment.iterations < 6 and 0.8 < found.sigma0 < 1.25
+    assert not np.any(find_rays(found.block, measured, bad) & found.numbered.rays)
