@@ -125,7 +125,7 @@ class Rings(AbstractZones):
     lie on one side of the image."""
 
     r: Pieces
-    about_centroid: bool = False
+    about_centroid: bool = eqx.field(static=True, default=False)
 
     @property
     def count(self) -> int:

@@ -423,24 +423,3 @@ def test_the_table_of_1982_is_reproduced():
         and "misprint for 0.069" in told
     )
     assert "(20) H² / x B, n = 9 5386 5500" in told
-
-
-def test_labels_of_the_picture_cover_neither_each_other_nor_points():
-    pytest.importorskip("matplotlib")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    from jaxro.reports.plots import _label
-
-    figure = Figure(figsize=(5, 5))
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    places = np.random.default_rng(0).uniform(0, 1, (60, 2))
-    axes.plot(*places.T, ".")
-    figure.draw_without_rendering()
-    _label(axes, places, [f"p{k}  12.3" for k in range(60)])
-    boxes = [text.get_window_extent() for text in axes.texts]
-    assert 20 < len(boxes) < 60
-    for k, box in enumerate(boxes):
-        assert not box.count_overlaps(boxes[k + 1 :])
-        assert not any(box.contains(*p) for p in axes.transData.transform(places))
