@@ -16,7 +16,9 @@ from . import (
     assessment as assessment,
     block as block,
     calibration as calibration,
+    exchange as exchange,
     orientation as orientation,
+    plots as plots,
     rejection as rejection,
     surveys as surveys,
 )

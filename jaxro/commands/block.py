@@ -6,9 +6,10 @@ from ..block.bars import NoBar
 from ..block.chain import Unjoined
 from ..block.orient_block import orient_block
 from ..block.place import TooLittleControl
-from ..reports import block as report, block_comparisons as comparisons
-from ..reports.block_files import contents
+from ..reports import block as report, block_comparisons as comparisons, block_plots
+from ..reports.block_files import contents, summary
 from ..reports.block_model import Done
+from ..reports.html.block import page_of_block
 from ..reports.terminal import consoles, say_what
 from ..tables import (
     whole,
@@ -16,6 +17,8 @@ from ..tables import (
 from ..tables.fields import TableError
 from . import block_other_ways as other_ways
 from .block_request import Options, Task, inner_of, prepare, some_of
+from .documents import settings, show_json
+from .plots import MISSING, pictures_of_block, to_files
 
 
 def run(options: Options) -> bool:
@@ -25,8 +28,14 @@ def run(options: Options) -> bool:
     out = options.measured.out
     inputs = whole.Inputs(*options.read)
     written, why = [], ""
-    with whole.claim(out, whole.check_target, options.measured.force):
+    documents = options.measured.documents
+    with (
+        whole.claim(out, whole.check_target, options.measured.force),
+        documents.claimed(),
+    ):
         task, made = prepare(options)
+        for warning in task.warnings:
+            errors.print(f"Warning: {warning}", style="yellow", markup=False)
         done = calculate(task, options)
         if out is not None:
             picture, why = _picture(done)
@@ -34,12 +43,17 @@ def run(options: Options) -> bool:
             inputs.check()
             whole.write(out, files, options.read)
             written = list(files)
+        told = write_documents(done, options)
+    if documents.json:
+        show_json(summary(done))
+        return done.usable
     report.show(console, done)
     compare(console, done, task, options)
     if why:
         errors.print(f"Warning: no picture: {why}", style="yellow", markup=False)
     if written:
         console.print(f"Written to {out}: {', '.join(written)}", markup=False)
+    console.print(told, end="", markup=False)
     if options.measured.file is None:
         console.print(
             "This was a simulated block. Your own: jaxro block PAIRS.csv --control "
@@ -49,16 +63,27 @@ def run(options: Options) -> bool:
     return done.usable
 
 
+def write_documents(done: Done, options: Options) -> str:
+    """Make the report and the pictures that are asked for; a line for each."""
+    documents = options.measured.documents
+    if not documents:
+        return ""
+    told = settings(options, options.read)
+    return documents.write(
+        page=lambda: page_of_block(done, told),
+        pictures=lambda: pictures_of_block(done),
+        read=options.read,
+    )
+
+
 def _picture(done: Done) -> tuple[dict[str, bytes], str]:
     """The picture of the block, or why there is none."""
     if not done.usable:
         return {}, ""
     try:
-        from ..reports.block_plots import picture
-
-        return {"block.png": picture(done)}, ""
+        return to_files({"block": block_plots.draw(done)}), ""
     except ModuleNotFoundError:
-        return {}, "it needs matplotlib: pip install 'jaxro[plots]'"
+        return {}, MISSING
 
 
 def compare(console: Console, done: Done, task: Task, options: Options) -> None:
@@ -120,7 +145,7 @@ def calculate(task: Task, options: Options) -> Done:
     return Done(
         title=task.title,
         unit="units" if network else options.unit,
-        photo_unit=options.measured.unit,
+        photo_unit=task.photo_unit,
         sigma=task.sigma,
         pairs=task.names,
         oriented=oriented,

@@ -17,21 +17,19 @@ from ..block.measured_block import (
     from_pairs,
     ground as known_points,
 )
-from ..reports.terminal import say_what
 from ..tables import (
     bars as bar_tables,
-    csv as csv_tables,
     ground as ground_tables,
     images,
-    whole,
 )
 from ..tables.cameras import Cameras
 from ..tables.examples import block as example
 from ..tables.fields import TableError
 from ..tables.ground import GroundPoints
-from ..tables.measured import Table, to_list, to_ragged
+from ..tables.measured import Table, to_list
 from ..tables.survey_checks import Row
-from . import request, sigma as deviation
+from . import request
+from .block_pairs import measure, read_pairs
 
 RADIAL = ("k1", "k2", "k3")
 INNER = ("focal", "principal", *RADIAL, "tangential", "affinity")
@@ -92,6 +90,8 @@ class Task:
     more: MeasuredBlock | None = None
     bars: Bars | None = None
     approximate: int = 0
+    photo_unit: str = "mm"
+    warnings: tuple[str, ...] = ()
 
 
 def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
@@ -100,12 +100,11 @@ def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
     _check(options)
     if options.measured.file is None:
         return _simulate(options)
-    table = _read(options)
-    cameras = _cameras(options, table)
+    own, table, cameras = read_pairs(options.measured)
     left, right = cameras.photos_of(
         table.names, table.file, given=table.photos, place=table.first_line
     )
-    pairs, told = _measured(options, table, cameras)
+    pairs, told = measure(own, table, cameras)
     ground, approximate = None, 0
     if options.control is not None:
         points = ground_tables.read(
@@ -125,6 +124,8 @@ def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
         ground=ground,
         bars=_bars(options),
         approximate=approximate,
+        photo_unit=own.unit,
+        warnings=table.warnings,
     )
     return _with_rays(task, options, table, cameras), {}
 
@@ -207,79 +208,12 @@ def inner_of(given: str | None) -> Inner | None:
     )
 
 
-def _read(options: Options) -> Table:
-    """The pairs. Raises TableError."""
-    file = options.measured.file
-    assert file is not None
-    with say_what(f"Reading {file} ..."):
-        if not whole.is_parquet(file):
-            return csv_tables.read(file, options.measured.semicolons)
-        from ..tables import parquet
-
-        source = parquet.Source(file)
-        table = source.read(source.scan().begins)
-    twice = parquet.repeat_points(table)
-    if len(twice):
-        raise TableError(
-            file,
-            column="point",
-            found=f"a point a second time in pair {to_list(table.names)[twice[0]]!r}",
-            expected="each point once in a pair; rename it or delete one of the two",
-        )
-    return table
-
-
 def _bars(options: Options) -> Bars | None:
     """The scale bars. Raises TableError."""
     if options.bars is None:
         return None
     own = options.measured
     return bar_tables.read(options.bars, options.control_sigma, own.semicolons)
-
-
-def _cameras(options: Options, table: Table) -> Cameras:
-    """The cameras. Raises TableError where left and right photos have one each: in a
-    block a photo is the left one of a pair and the right one of the next."""
-    request.check_numbers(
-        options.measured, table.has_sigma, table.file, request.SYSTEMS["relative"]
-    )
-    cameras = request.read_cameras(options.measured, request.MEASURED)
-    if not cameras.photos and cameras.left != cameras.right:
-        raise TableError(
-            cameras.file,
-            found="cameras of left and of right photos",
-            expected="[camera] for all photos, or [photo.NAME] for each of them: a photo "
-            "is the left one of a pair, and the right one of another",
-        )
-    return cameras
-
-
-def _measured(options: Options, table: Table, cameras: Cameras) -> tuple[Ragged, str]:
-    """The pairs in photo coordinates, and what their standard deviation is. Raises
-    TableError."""
-    given = table.has_sigma or options.measured.sigma not in (None, deviation.AUTO)
-    both = cameras.of_all(
-        table.names,
-        table.file,
-        photos=table.photos,
-        one_sigma=given,
-        place=table.first_line,
-    )
-    if given:
-        sigma = deviation.parse(options.measured.sigma)
-        return to_ragged(table, both, sigma), "to the given standard deviations"
-    pairs = to_ragged(table, both, 1.0)
-    with say_what("Finding the standard deviation of the photo coordinates ..."):
-        noise = deviation.from_residuals(pairs)
-    photo = noise.applied(pairs)
-    unit = options.measured.unit if _plain(both) else "in the unit of the table"
-    return photo, deviation.sentence(noise, unit)
-
-
-def _plain(cameras: object) -> bool:
-    """Whether the table has the unit of the photos."""
-    each = [cameras] if isinstance(cameras, tuple) else cameras
-    return all(camera.pixel_size == 1 for both in each for camera in both)  # pyright: ignore
 
 
 def _ground(points: GroundPoints, sigma: float | None) -> tuple[Ground, int]:

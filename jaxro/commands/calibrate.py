@@ -13,7 +13,7 @@ from ..calibration.measured_images import FEWEST, find_unreached
 from ..calibration.of_image import of_image
 from ..calibration.starts import NEARLY_FLAT
 from ..reports import calibration as report
-from ..reports.calibration_files import contents
+from ..reports.calibration_files import contents, summary
 from ..reports.calibration_model import (
     Distances,
     Done,
@@ -25,6 +25,7 @@ from ..reports.calibration_model import (
     variants,
     zone_names,
 )
+from ..reports.html.calibration import page_of_calibration
 from ..reports.terminal import consoles, progress, say_compiling, say_what
 from ..tables import whole
 from ..tables.examples import calibration as example
@@ -36,6 +37,8 @@ from ..xla.settings import COMPILE_FAST
 from .calibration_request import Options, Task, prepare
 from .calibration_tests import Alone, compare_distortions, tested_zones
 from .corrected import Wanted, corrected_texts, read_wanted
+from .documents import settings, show_json
+from .plots import pictures_of_calibration
 
 LEAST_ROOM = 32
 """Points for which the program of a single image is compiled at least; further ones
@@ -52,9 +55,11 @@ def run(options: Options) -> bool:
     """Read, calibrate, show, write. True if every image has usable numbers. Raises
     TableError, with nothing written."""
     console, errors = consoles()
-    read = (options.file, options.object, options.correct)
-    inputs, texts, warnings = whole.Inputs(*read), {}, []
-    with whole.claim(options.out, whole.check_target, options.force):
+    inputs, texts, warnings = whole.Inputs(*options.read), {}, []
+    with (
+        whole.claim(options.out, whole.check_target, options.force),
+        options.documents.claimed(),
+    ):
         task = prepare(options)
         asked = read_wanted(options, task.named)
         programs.watch(lambda _: say_compiling((len(task.named.image),)))
@@ -64,12 +69,17 @@ def run(options: Options) -> bool:
             with say_what("Correcting ..."):
                 texts, warnings = write_texts(done, asked)
             inputs.check()
-            whole.write(options.out, texts, read)
+            whole.write(options.out, texts, options.read)
+        written = write_documents(done, options)
+    if options.documents.json:
+        show_json(summary(done))
+        return done.usable
     report.show(console, done)
     for warning in warnings:
         errors.print(f"Warning: {warning}", style="yellow", markup=False)
     if texts:
         console.print(f"Written to {options.out}: {', '.join(texts)}", markup=False)
+    console.print(written, end="", markup=False)
     if options.file is None:
         console.print(
             "This was a simulated example. Your own image: jaxro calibrate IMAGE.csv "
@@ -77,6 +87,19 @@ def run(options: Options) -> bool:
             markup=False,
         )
     return done.usable
+
+
+def write_documents(done: Done, options: Options) -> str:
+    """Make the report and the pictures that are asked for; a line for each."""
+    if not options.documents:
+        return ""
+    done = replace(done, maps=[corrections(one) for one in done.cameras])
+    told = settings(options, options.read)
+    return options.documents.write(
+        page=lambda: page_of_calibration(done, told),
+        pictures=lambda: pictures_of_calibration(done),
+        read=options.read,
+    )
 
 
 def write_texts(
@@ -92,9 +115,7 @@ def write_texts(
         texts |= of_places
         warnings += [told] if told else []
     try:
-        from ..reports.calibration_plots import pictures
-
-        texts |= pictures(done)
+        texts |= pictures_of_calibration(done)
     except ModuleNotFoundError:
         warnings.append("no pictures: they need matplotlib: pip install 'jaxro[plots]'")
     return texts, warnings

@@ -13,6 +13,7 @@ from ..tables.examples import calibration as example
 from ..tables.fields import TableError
 from ..tables.images import NamedImages
 from .calibration_models import select_models
+from .documents import NO_DOCUMENTS, Documents
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,12 @@ class Options:
     unit: str = "px"
     out: Path | None = None
     force: bool = False
+    documents: Documents = NO_DOCUMENTS
+
+    @property
+    def read(self) -> tuple[Path | None, ...]:
+        """The files that are read."""
+        return self.file, self.object, self.correct
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,12 @@ told and written."""
 
 from ..rejection import PROCEDURES, AbstractProcedure
 from ..reports import cleaning as report, files, verdicts as decisions
+from ..reports.html.pairs import Cleaned
 from ..reports.terminal import consoles, progress
 from ..tables.examples import mock_pair as example
 from ..tables.fields import TableError
 from . import orient as jobs, sigma
+from .documents import show_json
 from .request import Example, Options
 from .tolerances import change, check_sigma, tolerances
 
@@ -28,18 +30,27 @@ def run(options: Options, name: str, changes: list[str]) -> bool:
         with progress(errors, "Cleaning", len(job.table.names)) as told:
             results, verdicts = jobs.solve_table(job, told)
         assert verdicts is not None
-        written = ""
-        if options.out is not None:
-            summary = job.summary(results)
-            heading = {
-                "program": summary["program"],
-                "file": summary["file"],
-                "procedure": name,
-                **sigma.entry(job.noise),
-                "tolerances": tolerances(procedure),
-            }
-            texts = decisions.texts(verdicts, job.units, heading)
-            written = write(texts | files.texts(results, summary))
+        summary = job.summary(results)
+        heading = {
+            "program": summary["program"],
+            "file": summary["file"],
+            "procedure": name,
+            **sigma.entry(job.noise),
+            "tolerances": tolerances(procedure),
+        }
+        written = write(
+            lambda: (
+                decisions.texts(verdicts, job.units, heading)
+                | files.texts(results, summary)
+            )
+        )
+        cleaned = Cleaned(verdicts, name, tolerances(procedure))
+        written += jobs.write_documents(job, results, cleaned)
+    good = bool(results.usable.all()) and set(verdicts.outcomes) == {"finished"}
+    if options.documents.json:
+        found = decisions.summary_of(verdicts, heading)
+        show_json(found | {"orientation": files.summary_of(results, summary)})
+        return good
     jobs.show_sigma(console, job)
     report.show(console, verdicts, name, job.units.photo)
     jobs.show(console, job, results)
@@ -50,7 +61,7 @@ def run(options: Options, name: str, changes: list[str]) -> bool:
             "--focal F",
             markup=False,
         )
-    return bool(results.usable.all()) and set(verdicts.outcomes) == {"finished"}
+    return good
 
 
 def choose_procedure(name: str, changes: list[str]) -> tuple[str, AbstractProcedure]:

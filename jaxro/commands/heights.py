@@ -5,16 +5,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..reports import survey as report
-from ..reports.survey_files import Done, calculate, contents
+from ..reports.html.survey import page_of_heights
+from ..reports.survey_files import Done, calculate, contents, summary
 from ..reports.terminal import consoles
 from ..surveys.planning import Deviations
 from ..tables import survey as tables, whole
 from ..tables.examples import survey as example
 from ..tables.fields import TableError
 from ..tables.survey import Named
+from .documents import NO_DOCUMENTS, Documents, settings, show_json
+from .plots import MISSING, pictures_of_heights
 
 
 @dataclass(frozen=True)
@@ -30,22 +31,35 @@ class Options:
     out: Path | None
     force: bool
     semicolons: bool = False
+    documents: Documents = NO_DOCUMENTS
+
+    @property
+    def read(self) -> tuple[Path | None, ...]:
+        """The files that are read."""
+        return self.file, self.grid, self.traverses
 
 
 def run(options: Options) -> bool:
     """Read, calculate, show, write. True unless a traverse is suspicious. Raises
     TableError, with nothing written."""
     console, errors = consoles()
-    read = (options.file, options.grid, options.traverses)
     title = "the simulated plot" if options.file is None else str(options.file)
-    inputs, texts, why = whole.Inputs(*read), {}, ""
-    with whole.claim(options.out, whole.check_target, options.force):
+    inputs, texts, why = whole.Inputs(*options.read), {}, ""
+    with (
+        whole.claim(options.out, whole.check_target, options.force),
+        options.documents.claimed(),
+    ):
         done = calculate(prepare(options))
         if options.out is not None:
             picture, why = drawn(done, title)
             texts: dict[str, Any] = contents(done) | picture
             inputs.check()
-            whole.write(options.out, texts, read)
+            whole.write(options.out, texts, options.read)
+        written = write_documents(done, title, options)
+    good = not (done.suspicious or done.doubtful)
+    if options.documents.json:
+        show_json(summary(done))
+        return good
     report.show(console, done, title)
     if why:
         errors.print(
@@ -53,6 +67,7 @@ def run(options: Options) -> bool:
         )
     if texts:
         console.print(f"Written to {options.out}: {', '.join(texts)}", markup=False)
+    console.print(written, end="", markup=False)
     if options.file is None:
         console.print(
             "This was a simulated example. Your own survey: jaxro heights READINGS.csv "
@@ -60,7 +75,19 @@ def run(options: Options) -> bool:
             "--camera-height H --base B",
             markup=False,
         )
-    return not (done.suspicious or done.doubtful)
+    return good
+
+
+def write_documents(done: Done, title: str, options: Options) -> str:
+    """Make the report and the pictures that are asked for; a line for each."""
+    if not options.documents:
+        return ""
+    told = settings(options, options.read)
+    return options.documents.write(
+        page=lambda: page_of_heights(done, title, told),
+        pictures=lambda: pictures_of_heights(done, title),
+        read=options.read,
+    )
 
 
 def prepare(options: Options) -> Named:
@@ -163,28 +190,6 @@ def drawn(done: Done, title: str) -> tuple[dict[str, bytes], str]:
     if done.named.places is None:
         return {}, "the readings have no columns x and y for every point"
     try:
-        from ..reports.plots import surface
-
-        n = done.named.points
-        value, deviation = (
-            np.asarray(a.value[:n]) for a in (done.found.heights, done.found.deviations)
-        )
-        return {
-            "surface.png": surface(
-                *done.named.places,
-                value,
-                deviation,
-                done.named.names[:n],
-                _legs(done),
-                f"Heights of {title}",
-            )
-        }, ""
+        return pictures_of_heights(done, title), ""
     except ModuleNotFoundError:
-        return {}, "it needs matplotlib: pip install 'jaxro[plots]'"
-
-
-def _legs(done: Done) -> np.ndarray:
-    """The first and the last point of every leg between points that have a place."""
-    survey = done.named.survey
-    both = np.stack([np.asarray(survey.start), np.asarray(survey.end)])
-    return both[:, np.all(both < done.named.points, axis=0)]
+        return {}, MISSING

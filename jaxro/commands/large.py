@@ -25,7 +25,7 @@ from ..tables.cameras import Cameras
 from ..tables.conversion import convert
 from ..tables.fields import TableError
 from ..tables.measured import to_ragged
-from . import sigma as deviation
+from . import other_programs, sigma as deviation
 from .journal import CONVERSION, JOURNAL, MODIFIED, Job, here, previous_request
 from .request import (
     MEASURED,
@@ -70,6 +70,7 @@ def run(
 ) -> bool:
     """Plan, work, tell. True if every pair is cleaned and usable. Raises TableError;
     finished parts can be resumed."""
+    _check_whole(options)
     spent = stopwatch()
     console, errors = consoles()
     told = "Cleaning" if procedure else "Orienting"
@@ -80,6 +81,30 @@ def run(
             summary = _work(job, large, tell, options.force)
     show(console, job, summary, spent())
     return good(summary)
+
+
+def _check_whole(options: Options) -> None:
+    """Raises TableError for what is made of a whole table at once."""
+    if other_programs.is_asked(options):
+        raise TableError(
+            str(options.file),
+            found="a file of another program, and Parquet results",
+            expected="it without --parquet, or a table",
+        )
+    documents = options.documents
+    for name, asked in (
+        ("--report", documents.report is not None),
+        ("--plots", documents.plots is not None),
+        ("--json", documents.json),
+        ("--g2o", options.g2o is not None),
+    ):
+        if asked:
+            raise TableError(
+                name,
+                found="it with Parquet results",
+                expected="a CSV table without --parquet, whose pairs are looked at "
+                "together; DIR/elements holds the results of any number",
+            )
 
 
 def check_folder_name(folder: Path, force: bool) -> None:
@@ -213,7 +238,7 @@ def _plan(
         scan.names,
         str(table.path),
         photos=scan.photos,
-        one_sigma=known,
+        one_sigma=known and not table.has_covariances,
         place=lambda number: table.place(int(scan.begins[number])),
     )
     noise = None

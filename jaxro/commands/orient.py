@@ -4,7 +4,6 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -16,12 +15,16 @@ from ..batches.table_noise import TableNoise
 from ..rejection import AbstractProcedure
 from ..reports import files, pair as report, reliability
 from ..reports.columns import TABLES, Units
+from ..reports.html.pairs import Cleaned, page_of_pairs
 from ..reports.model import Results, find_patterns
 from ..reports.terminal import consoles, progress, say_what
 from ..reports.verdicts import Verdicts
 from ..tables import csv as tables, whole
+from ..tables.cameras import Cameras
+from ..tables.fields import TableError
 from ..tables.measured import CameraPairs, Table, to_ragged
-from . import sigma as deviation
+from . import other_programs, sigma as deviation
+from .documents import settings, show_json
 from .request import (
     MEASURED,
     SYSTEMS,
@@ -44,6 +47,7 @@ class Job:
     pairs: Ragged
     task: Task
     units: Units
+    known: Cameras
     noise: TableNoise | None = None
 
     @property
@@ -83,19 +87,14 @@ def prepare(
     """Everything read and checked; `otherwise`: the table where no file is named.
     Raises TableError."""
     system = SYSTEMS[options.elements or ("relative" if options.file else "dependent")]
-    if options.file is None:
-        table = tables.parse(otherwise.table, otherwise.name, otherwise.name)
-    else:
-        with say_what(f"Reading {options.file} ..."):
-            table = tables.read(options.file, options.semicolons)
-    known = read_cameras(options, otherwise)
+    options, table, known = _read(options, otherwise)
     check_numbers(options, table.has_sigma, table.file, system)
     sigma_known = table.has_sigma or options.sigma is not None
     cameras = known.of_all(
         table.names,
         table.file,
         photos=table.photos,
-        one_sigma=sigma_known,
+        one_sigma=sigma_known and not table.has_covariances,
         place=table.first_line,
     )
     noise = None
@@ -104,7 +103,7 @@ def prepare(
     sigma = deviation.parse(options.sigma) if noise is None else noise.sigma
     task = Task(
         system=system,
-        tables=_tables(table, options.out, sigma_known, procedure is not None),
+        tables=_tables(table, options, sigma_known, procedure is not None),
         sigma_known=sigma_known,
         base=options.base,
         residual=options.residual,
@@ -118,15 +117,29 @@ def prepare(
         pairs=to_ragged(table, cameras, sigma),
         task=task,
         units=units_of(options, table.has_sigma, system),
+        known=known,
         noise=noise,
     )
 
 
+def _read(options: Options, otherwise: Example) -> tuple[Options, Table, Cameras]:
+    """The options with the unit of the file, its pairs and their cameras. Raises
+    TableError."""
+    if options.file is None:
+        table = tables.parse(otherwise.table, otherwise.name, otherwise.name)
+        return options, table, read_cameras(options, otherwise)
+    with say_what(f"Reading {options.file} ..."):
+        if other_programs.is_asked(options):
+            return other_programs.read(options)
+        table = tables.read(options.file, options.semicolons)
+    return options, table, read_cameras(options, otherwise)
+
+
 def _tables(
-    table: Table, out: Path | None, sigma_known: bool, cleaned: bool
+    table: Table, options: Options, sigma_known: bool, cleaned: bool
 ) -> tuple[str, ...]:
     """The tables that files and the terminal need."""
-    if out is not None:
+    if options.out is not None or options.documents:
         return TABLES
     if len(table.names) > 1:
         return ("elements", "residuals") if cleaned else ("elements",)
@@ -164,9 +177,13 @@ def run(options: Options) -> bool:
         warn(errors, job)
         with progress(errors, "Orienting", len(job.table.names)) as told:
             results, _ = solve_table(job, told)
-        written = ""
-        if options.out is not None:
-            written = write(files.texts(results, job.summary(results)))
+        summary = job.summary(results)
+        written = write(lambda: files.texts(results, summary))
+        written += write_documents(job, results)
+        written += write_pose_graph(job)
+    if options.documents.json:
+        show_json(files.summary_of(results, summary))
+        return bool(results.usable.all())
     show_sigma(console, job)
     show(console, job, results)
     console.print(written, end="", markup=False)
@@ -185,22 +202,77 @@ def warn(errors: Console, job: Job) -> None:
         errors.print(f"Warning: {warning}", style="yellow", markup=False)
 
 
+Texts = Callable[[], dict[str, str]]
+"""Makes files by name."""
+
+
 @contextmanager
-def writing(options: Options) -> Iterator[Callable[[dict[str, str]], str]]:
-    """Within the block --out is written to by this process alone, by the function that
-    it gets: the files by name, and where they are as a line. Raises TableError, then
-    nothing is written, also where the input is not any more what it was."""
-    read = (options.file, options.camera)
-    inputs = whole.Inputs(*read)
+def writing(options: Options) -> Iterator[Callable[[Texts], str]]:
+    """Within the block --out and the documents are written to by this process alone. The
+    function that it gets writes the files of --out, if it is asked for, and says where
+    they are. Raises TableError, then nothing is written, also where the input is not any
+    more what it was."""
+    inputs = whole.Inputs(*options.read)
 
-    def write(texts: dict[str, str]) -> str:
-        assert options.out is not None
+    def write(texts: Texts) -> str:
         inputs.check()
-        whole.write(options.out, texts, read)
-        return f"Written to {options.out}: {', '.join(texts)}\n"
+        if options.out is None:
+            return ""
+        made = texts()
+        whole.write(options.out, made, options.read)
+        return f"Written to {options.out}: {', '.join(made)}\n"
 
-    with whole.claim(options.out, whole.check_target, options.force):
+    with (
+        whole.claim(options.out, whole.check_target, options.force),
+        whole.claim(options.g2o, whole.check_file, options.force),
+        options.documents.claimed(),
+    ):
         yield write
+
+
+def write_pose_graph(job: Job) -> str:
+    """Write the pose graph that is asked for; a line about it."""
+    options = job.options
+    if options.g2o is None:
+        return ""
+    from .pose_graph import graph_text, write_graph
+
+    if options.file is None:
+        raise TableError(
+            "--g2o",
+            found="it without FILE.csv",
+            expected="a table whose pairs name their photos",
+        )
+    text, told = graph_text(
+        job.table,
+        job.known,
+        job.pairs,
+        job.task.sigma_known,
+        residual=job.task.keywords["residual"],
+    )
+    return write_graph(options.g2o, text, told, options.read)
+
+
+def write_documents(job: Job, results: Results, cleaned: Cleaned | None = None) -> str:
+    """Make the report and the pictures that are asked for; a line for each."""
+    options = job.options
+    if not options.documents:
+        return ""
+    from .plots import pictures_of_pairs
+
+    known = None if job.noise is None else deviation.sentence(job.noise, "")
+    told = settings(
+        options,
+        options.read,
+        Elements=job.system_name,
+        Residuals=options.residual,
+        Sigma=known and known.removeprefix("sigma "),
+    )
+    return options.documents.write(
+        page=lambda: page_of_pairs(results, cleaned, told),
+        pictures=lambda: pictures_of_pairs(results, cleaned and cleaned.verdicts),
+        read=options.read,
+    )
 
 
 def show_sigma(console: Console, job: Job) -> None:

@@ -18,6 +18,7 @@ from ..tables import cameras as camera_files
 from ..tables.examples import pair as example
 from ..tables.fields import TableError
 from . import sigma as deviation
+from .documents import NO_DOCUMENTS, Documents
 
 SYSTEMS: dict[str, type[AbstractElements]] = {
     "relative": RelativePose,
@@ -46,6 +47,13 @@ class Options:
     force: bool = False
     confidence: float | None = None
     semicolons: bool = False
+    documents: Documents = NO_DOCUMENTS
+    g2o: Path | None = None
+
+    @property
+    def read(self) -> tuple[Path | None, ...]:
+        """The files that are read."""
+        return self.file, self.camera
 
 
 class Example(NamedTuple):

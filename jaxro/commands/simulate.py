@@ -24,6 +24,7 @@ from ..tables.fields import TableError
 from ..tables.measured import one_pair
 from . import orient as jobs, sigma as deviation
 from .clean import find_procedure
+from .plots import check_picture, picture_of_comparison
 from .request import Options
 
 SIGMA = 0.01
@@ -43,6 +44,7 @@ class Wanted:
     seed: int
     false_alarms: float
     out: Path | None
+    plot: Path | None
     force: bool
 
 
@@ -85,9 +87,13 @@ def run_comparison(options: Options, wanted: Wanted) -> bool:
             found=repr(wanted.false_alarms),
             expected="a share: 0, or less than 1",
         )
+    check_picture(wanted.plot)
     console, warnings = consoles()
-    inputs = whole.Inputs(options.file, options.camera)
-    with whole.claim(wanted.out, whole.check_file, wanted.force):
+    inputs = whole.Inputs(*options.read)
+    with (
+        whole.claim(wanted.out, whole.check_file, wanted.force),
+        whole.claim(wanted.plot, whole.check_file, wanted.force),
+    ):
         layouts = layouts_of(options, warnings)
         _check_errors(errors, layouts)
         with progress(warnings, "Comparing", None) as told:
@@ -101,13 +107,16 @@ def run_comparison(options: Options, wanted: Wanted) -> bool:
                 false_alarms=wanted.false_alarms,
                 progress=told,
             )
+        inputs.check()
         if wanted.out is not None:
-            inputs.check()
             whole.write_file(wanted.out, files.csv_text(rows(found)))
+        if wanted.plot is not None:
+            picture = picture_of_comparison(found, wanted.plot)
+            whole.write_file(wanted.plot, picture)
     for part in tables(found):
         console.print(part, markup=False)
-    if wanted.out is not None:
-        console.print(f"Written to {wanted.out}", markup=False)
+    for written in filter(None, (wanted.out, wanted.plot)):
+        console.print(f"Written to {written}", markup=False)
     return True
 
 

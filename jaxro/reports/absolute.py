@@ -9,8 +9,9 @@ from ..block.absolute_result import NAMES
 from ..block.absolute_verdict import RESULTS, advice_of
 from .absolute_files import Done
 from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
-from .pair import digits, join_names, left_out, table
+from .pair import digits, join_names, table
 from .reliability import DOUBTFUL
+from .rows import left_out
 from .text import number
 
 POORLY = 0.1

@@ -9,8 +9,9 @@ from ..adjustment import RESULTS
 from .block_files import ANGLES
 from .block_model import Done
 from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
-from .pair import MOST_ROWS, digits, join_names, left_out, table, worst
+from .pair import digits, join_names, table
 from .reliability import DOUBTFUL
+from .rows import left_out, most_rows, worst
 from .text import number
 
 POORLY = 0.1
@@ -22,32 +23,33 @@ SHOWN = 10
 
 def show(console: Console, done: Done) -> None:
     """The verdict, what fits, how accurate photos and points are, what to mind."""
-    _head(console, done)
-    console.print(_verdict(done))
+    console.print(
+        f"[bold]Block of {escape(done.title)}[/bold], {contents_in_words(done)}"
+    )
+    console.print(verdict(done))
     if done.usable:
-        console.print(_consistency(done), markup=False)
-        _left_out(console, done)
-        console.print(_accuracy(done), markup=False)
-        _cameras(console, done)
-        _photos(console, done)
-        _control(console, done)
-        show_checks(console, done.checks, "adjusted", done.unit, done.limit_of_checks)
-        _bars(console, done)
+        show_consistency(console, done)
+        show_accuracy(console, done)
+        show_cameras(console, done)
+        show_photos(console, done)
+        show_control(console, done)
+        show_check_points(console, done)
+        show_bars(console, done)
     for sentence in sentences(done):
         console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
 
 
-def _head(console: Console, done: Done) -> None:
+def contents_in_words(done: Done) -> str:
+    """What the block consists of, and what is known of the ground."""
     block = done.adjusted.block
     told = kinds_in_words(done.control.known)
     ground = "free network" if done.ground is None else f"control {told}"
     checks = f"; {len(done.checks.names)} check points" if done.ground else ""
     if done.adjusted.bars is not None:
         checks += f"; {len(done.adjusted.bars.one)} scale bars"
-    console.print(
-        f"[bold]Block of {escape(done.title)}[/bold], {len(block.photos)} photos in "
-        f"{len(done.pairs)} pairs, {np.sum(done.determined)} points on {len(block.x)} "
-        f"places; {ground}{checks}"
+    return (
+        f"{len(block.photos)} photos in {len(done.pairs)} pairs, "
+        f"{np.sum(done.determined)} points on {len(block.x)} places; {ground}{checks}"
     )
 
 
@@ -55,7 +57,7 @@ def _head(console: Console, done: Done) -> None:
 # the verdict
 
 
-def _verdict(done: Done) -> str:
+def verdict(done: Done) -> str:
     """Whether the numbers may be used, in one sentence."""
     if done.adjusted.result != RESULTS.successful:
         return f"[bold red]not usable[/bold red]: {RESULTS[done.adjusted.result]}"
@@ -75,6 +77,22 @@ def _fits(done: Done) -> str:
     if done.checks.names:
         text += f", and the check points within {in_words(done.checks, done.unit)}"
     return f"{text} (root mean squares)."
+
+
+def show_consistency(console: Console, done: Done) -> None:
+    """sigma0 with its test, and what was left out as wrong."""
+    console.print(_consistency(done), markup=False)
+    _show_left_out(console, done)
+
+
+def show_accuracy(console: Console, done: Done) -> None:
+    """Standard deviations of the points, and what an error that no test finds does."""
+    console.print(_accuracy(done), markup=False)
+
+
+def show_check_points(console: Console, done: Done) -> None:
+    """What check points say of the accuracy."""
+    show_checks(console, done.checks, "adjusted", done.unit, done.limit_of_checks)
 
 
 def _consistency(done: Done) -> str:
@@ -105,7 +123,7 @@ def _components(done: Done) -> str:
     return f"\nVariance components, times the stated: {', '.join(told)}"
 
 
-def _left_out(console: Console, done: Done) -> None:
+def _show_left_out(console: Console, done: Done) -> None:
     """What was left out as wrong."""
     rays, control = done.left_out, _wrong_control(done)
     if not rays and not control:
@@ -114,7 +132,7 @@ def _left_out(console: Console, done: Done) -> None:
     if control:
         console.print(
             f"[yellow]Control points left out as wrong:[/yellow] "
-            f"{join_names(control, SHOWN)}"
+            f"{escape(join_names(control, SHOWN))}"
         )
     if not rays:
         return
@@ -125,7 +143,7 @@ def _left_out(console: Console, done: Done) -> None:
     )
     rows = table("photo", "point", "v x", "v y", "|v|/sd", title=title)
     rows.columns[1].justify = "left"
-    for one in rays[:MOST_ROWS]:
+    for one in rays[: most_rows()]:
         photo = block.photos[block.photo[one.ray]]
         point = block.points[block.point[one.ray]]
         cells = [number(value, 4) for value in one.misfit]
@@ -177,7 +195,7 @@ def _hidden(done: Done) -> str:
 # tables
 
 
-def _cameras(console: Console, done: Done) -> None:
+def show_cameras(console: Console, done: Done) -> None:
     """The inner parameters that were unknown."""
     if done.adjusted.inner is None:
         return
@@ -192,7 +210,7 @@ def _cameras(console: Console, done: Done) -> None:
     console.print(rows)
 
 
-def _photos(console: Console, done: Done) -> None:
+def show_photos(console: Console, done: Done) -> None:
     adjusted = done.adjusted
     centres, of_centres = adjusted.centres, adjusted.centre_deviations
     angles, of_angles = (
@@ -217,7 +235,7 @@ def _photos(console: Console, done: Done) -> None:
     left_out(console, len(weak), "photos, the weakest shown")
 
 
-def _control(console: Console, done: Done) -> None:
+def show_control(console: Console, done: Done) -> None:
     if not done.control.names:
         return
     limit = done.tested.limit
@@ -232,7 +250,7 @@ def _control(console: Console, done: Done) -> None:
     left_out(console, len(done.control.names), "points, those with the largest shown")
 
 
-def _bars(console: Console, done: Done) -> None:
+def show_bars(console: Console, done: Done) -> None:
     bars, found = done.adjusted.bars, done.adjusted
     if bars is None:
         return

@@ -12,7 +12,6 @@ from .calibration_model import (
     BROWN,
     Done,
     Photo,
-    Variant,
     describe,
     lens_names,
     zone_names,
@@ -24,49 +23,43 @@ from .calibration_words import (
     decision,
     sentences,
 )
-from .pair import digits, join_names, left_out, table, worst
+from .pair import digits, join_names, table
+from .rows import left_out, some_rows, worst
 from .text import number
 
 AXES = ("X", "Y", "Z")
 ANGLES = ("omega", "phi", "kappa")
 
 LARGEST = 8
-"""Residuals that are shown."""
+"""Residuals that a terminal shows."""
 
 SHOWN = 10
 """Names of images that are shown in a line."""
 
 TRIED = 12
-"""Variants that are shown."""
+"""Variants that a terminal shows."""
 
 
 def show(console: Console, done: Done) -> None:
     """What was decided, station, camera, residuals, the variants, and what to mind."""
-    _head(console, done)
-    if len(done.photos) == 1:
-        _verdict(console, done, done.photos[0])
-    else:
-        _verdict_of_many(console, done)
-    _tests(console, done)
+    console.print(
+        f"[bold]Calibration of {escape(done.title)}[/bold], {contents_in_words(done)}"
+    )
+    show_verdict(console, done)
+    show_tests(console, done)
     if done.cameras:
-        _stations(console, done)
-        _cameras(console, done)
-        _points(console, done)
-    if done.distances is not None:
-        _distances(console, done)
-    for one in done.cameras if not done.together else []:
-        if len(done.photos) == 1:
-            _residuals(console, done, [one])
-    if len(done.photos) > 1 and done.cameras:
-        _residuals(console, done, [one for one in done.photos if one.usable])
-    if len(done.variants) == 1:
-        (rows,) = done.variants.values()
-        _variants(console, done, rows)
+        show_stations(console, done)
+        show_cameras(console, done)
+        show_points(console, done)
+    show_distances(console, done)
+    show_residuals(console, done)
+    show_variants(console, done)
     for sentence in sentences(done):
         console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
 
 
-def _head(console: Console, done: Done) -> None:
+def contents_in_words(done: Done) -> str:
+    """What is calibrated."""
     images = len(done.photos)
     how = ""
     if images > 1:
@@ -77,14 +70,19 @@ def _head(console: Console, done: Done) -> None:
             if done.together
             else ", each alone"
         )
-    console.print(
-        f"[bold]Calibration of {escape(done.title)}[/bold], "
-        f"{len(done.named.image)} places of {len(done.named.points)} points{how}"
-    )
+    return f"{len(done.named.image)} places of {len(done.named.points)} points{how}"
 
 
 # -------------------------------------------------------------------------------------
 # the verdict
+
+
+def show_verdict(console: Console, done: Done) -> None:
+    """What the images need, and how well it fits; why there is nothing."""
+    if len(done.photos) == 1:
+        _verdict(console, done, done.photos[0])
+    else:
+        _verdict_of_many(console, done)
 
 
 def _verdict(console: Console, done: Done, one: Photo) -> None:
@@ -104,7 +102,7 @@ def _verdict_of_many(console: Console, done: Done) -> None:
         return
     for result in dict.fromkeys(one.result for one in failed):
         alike = [one for one in failed if one.result == result]
-        names = join_names([one.name for one in alike], SHOWN)
+        names = escape(join_names([one.name for one in alike], SHOWN))
         console.print(f"[bold red]{names}: {result}[/bold red]: {advice(alike[0])}")
     if done.together:
         console.print(f"[green]{decision(done, done.photos[0])}[/green]")
@@ -118,7 +116,7 @@ def _verdict_of_many(console: Console, done: Done) -> None:
             )
 
 
-def _tests(console: Console, done: Done) -> None:
+def show_tests(console: Console, done: Done) -> None:
     """Whether zones differ, and distortions."""
     usable = [one for one in done.photos if one.usable]
     for one in usable[:1] if done.together else usable:
@@ -136,7 +134,7 @@ def _tests(console: Console, done: Done) -> None:
 # tables
 
 
-def _stations(console: Console, done: Done) -> None:
+def show_stations(console: Console, done: Done) -> None:
     """Station and angles of each image; of one image a line for each number."""
     shown = [one for one in done.photos if one.usable]
     if len(done.photos) == 1:
@@ -181,7 +179,7 @@ def _cells(values: np.ndarray, deviations: np.ndarray) -> list[str]:
     return cells
 
 
-def _cameras(console: Console, done: Done) -> None:
+def show_cameras(console: Console, done: Done) -> None:
     """The inner orientation of each camera."""
     rows = table("camera", "parameter", "value", "± sd", title=_camera_title(done))
     rows.columns[1].justify = "left"
@@ -232,7 +230,7 @@ def _number_and_deviation(value: float, deviation: float) -> tuple[str, str]:
     return number(value, decimals), given
 
 
-def _points(console: Console, done: Done) -> None:
+def show_points(console: Console, done: Done) -> None:
     """How well the unknown object points are determined."""
     points = done.points
     if points is None or np.all(points.known):
@@ -250,9 +248,11 @@ def _points(console: Console, done: Done) -> None:
     )
 
 
-def _distances(console: Console, done: Done) -> None:
+def show_distances(console: Console, done: Done) -> None:
+    """The results by distances beside those by coordinates, where they are asked for."""
     found = done.distances
-    assert found is not None
+    if found is None:
+        return
     one = done.photos[0].figures
     rows = table(
         "parameter",
@@ -284,14 +284,17 @@ def _distances(console: Console, done: Done) -> None:
     )
 
 
-def _residuals(console: Console, done: Done, photos: list[Photo]) -> None:
+def show_residuals(console: Console, done: Done) -> None:
     """The coordinates with the largest residuals over their standard deviations."""
+    photos = [one for one in done.photos if one.usable]
+    if not photos or not done.cameras:
+        return
     several = len(photos) > 1
     entries = []
     for one in photos:
         w = np.abs(done.w(one))
         entries += [(one, k, float(np.max(w[k]))) for k in range(len(w))]
-    shown = sorted(entries, key=lambda entry: -entry[2])[:LARGEST]
+    shown = sorted(entries, key=lambda entry: -entry[2])[: some_rows(LARGEST)]
     w = "|w|" if done.sigma_known else "tau"
     limits = ", ".join({number(done.limit(one), 2) for one in photos[:1]})
     title = f"Largest residuals [{done.unit}], redundancy r, {w} (limit {limits})"
@@ -316,11 +319,14 @@ def _typical(photos: list[Photo]) -> float:
     return float(np.sqrt(np.mean(every**2)))
 
 
-def _variants(console: Console, done: Done, rows: list[Variant]) -> None:
+def show_variants(console: Console, done: Done) -> None:
     """The models compared: the best ones, and the best without a field and a lens."""
+    if len(done.variants) != 1:
+        return
+    (rows,) = done.variants.values()
     if len(rows) < 2:
         return
-    shown = rows[:TRIED]
+    shown = rows[: some_rows(TRIED)]
     plain = [v for v in rows if v.model.field is None]
     shown += [v for v in plain[:2] + plain[-2:] if all(v is not w for w in shown)]
     shown = [row for row in rows if any(row is one for one in shown)]

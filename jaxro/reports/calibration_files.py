@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import __version__
 from . import files
 from .calibration_model import (
     BROWN,
@@ -24,9 +25,9 @@ ANGLES = ("omega", "phi", "kappa")
 Row = dict[str, Any]
 
 
-def contents(done: Done) -> dict[str, str]:
-    """The tables by name."""
-    tables: dict[str, list[Row]] = {
+def tables(done: Done) -> dict[str, list[Row]]:
+    """The rows of the tables by the names of their files; of those that have any."""
+    found: dict[str, list[Row]] = {
         "cameras.csv": [
             _camera(done, one) | _zone_test(done, one) for one in done.photos
         ],
@@ -42,7 +43,28 @@ def contents(done: Done) -> dict[str, str]:
         "difference_tests.csv": [_difference(one) for one in done.differences],
         "distances.csv": [] if done.distances is None else _distances(done.distances),
     }
-    return {name: files.rows_text(rows) for name, rows in tables.items() if rows}
+    return {name: rows for name, rows in found.items() if rows}
+
+
+def contents(done: Done) -> dict[str, str]:
+    """The files by name."""
+    texts = {name: files.rows_text(rows) for name, rows in tables(done).items()}
+    return texts | {"summary.json": files.json_text(summary(done))}
+
+
+def summary(done: Done) -> Row:
+    """What summary.json says."""
+    return {
+        "program": f"jaxro {__version__}",
+        "file": done.title,
+        "unit": done.unit,
+        "together": done.together,
+        "usable": done.usable,
+        "images": [
+            _camera(done, one) | _zone_test(done, one) | _station(one)
+            for one in done.photos
+        ],
+    }
 
 
 def _pairs(names, values: np.ndarray, deviations: np.ndarray, usable: bool) -> Row:

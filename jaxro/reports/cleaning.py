@@ -2,11 +2,14 @@
 
 from collections import defaultdict
 
+import numpy as np
+from jaxtyping import Int
 from rich.console import Console
 from rich.markup import escape
 
 from .columns import OUTCOME_ADVICE
-from .pair import MOST_ROWS, join_names
+from .pair import join_names
+from .rows import left_out, most_rows
 from .text import number, table
 from .verdicts import Verdicts
 
@@ -19,9 +22,8 @@ def show(console: Console, verdicts: Verdicts, procedure: str, unit: str) -> Non
         f"[bold]Cleaning of {f'{len(names)} pairs' if many else escape(names[0])}[/bold] "
         f"by {procedure}: {rejected} of {len(verdicts.table.points)} points rejected"
     )
-    if rejected:
-        _show_rejections(console, verdicts, unit)
-    _show_doubts(console, verdicts)
+    _show_rejections(console, verdicts, verdicts.rejected, unit, many)
+    _show_doubts(console, verdicts, many)
     by_outcome: dict[str, list[str]] = defaultdict(list)
     for name, outcome in zip(names, verdicts.outcomes, strict=True):
         by_outcome[outcome].append(name)
@@ -33,17 +35,37 @@ def show(console: Console, verdicts: Verdicts, procedure: str, unit: str) -> Non
         else:
             console.print(
                 f"[bold red]{outcome.upper()}[/bold red] "
-                f"{join_names(members, MOST_ROWS)}{counted}: {OUTCOME_ADVICE[outcome]}"
+                f"{escape(join_names(members, most_rows()))}{counted}: {OUTCOME_ADVICE[outcome]}"
             )
     console.print()
 
 
-def _show_rejections(console: Console, verdicts: Verdicts, unit: str) -> None:
+def show_one(console: Console, verdicts: Verdicts, pair: int, unit: str) -> None:
+    """What was decided about one of many pairs."""
+    rejected = verdicts.rejected
+    own = rejected[verdicts.table.owners[rejected] == pair]
+    if not own.size:
+        console.print("No point was rejected.")
+    _show_rejections(console, verdicts, own, unit, many=False)
+    doubtful = verdicts.undecided
+    if pair in doubtful:
+        console.print(_doubt(doubtful[pair]), markup=False)
+
+
+def _show_rejections(
+    console: Console,
+    verdicts: Verdicts,
+    rejected: Int[np.ndarray, " some"],
+    unit: str,
+    many: bool,
+) -> None:
+    """The rejected points of these rows; `many`: with the name of their pair."""
+    if not rejected.size:
+        return
     owner, found = verdicts.table.owners, verdicts.of_points
-    many = len(verdicts.table.names) > 1
     first = ("pair", "point") if many else ("point",)
     rows = table(*first, "order", "statistic", "limit", f"q [{unit}]", left=len(first))
-    for row in verdicts.rejected[:MOST_ROWS]:
+    for row in rejected[: most_rows()]:
         pair, point = verdicts.table.names[owner[row]], verdicts.table.points[row]
         rows.add_row(
             *map(escape, (pair, point) if many else (point,)),
@@ -56,21 +78,17 @@ def _show_rejections(console: Console, verdicts: Verdicts, unit: str) -> None:
         "Statistic against its limit, and q at the orientation of the points kept:"
     )
     console.print(rows)
-    count = len(verdicts.rejected)
-    if count > MOST_ROWS:
-        console.print(f"{MOST_ROWS} of {count} rejections; --out DIR writes all.")
+    left_out(console, len(rejected), "rejections")
 
 
-def _show_doubts(console: Console, verdicts: Verdicts) -> None:
+def _show_doubts(console: Console, verdicts: Verdicts, many: bool) -> None:
     """Of which points one is wrong, by pair."""
     doubtful, names = verdicts.undecided, verdicts.table.names
-    for pair in list(doubtful)[:MOST_ROWS]:
-        of = f"{names[pair]}: " if len(names) > 1 else ""
-        console.print(
-            f"{of}wrong is one of {', '.join(doubtful[pair])}; nothing tells which.",
-            markup=False,
-        )
-    if len(doubtful) > MOST_ROWS:
-        console.print(
-            f"{MOST_ROWS} of {len(doubtful)} undecided pairs; --out DIR writes all."
-        )
+    for pair in list(doubtful)[: most_rows()]:
+        of = f"{names[pair]}: " if many else ""
+        console.print(of + _doubt(doubtful[pair]), markup=False)
+    left_out(console, len(doubtful), "undecided pairs")
+
+
+def _doubt(points: list[str]) -> str:
+    return f"wrong is one of {', '.join(points)}; nothing tells which."

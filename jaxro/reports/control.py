@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .pair import digits, left_out, table, worst
+from .pair import digits, table
+from .rows import left_out, worst
 from .text import number
 
 AXES = ("X", "Y", "Z")

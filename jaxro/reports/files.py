@@ -28,7 +28,7 @@ def texts(results: Results, summary: dict[str, Any]) -> dict[str, str]:
         f"{name}.csv": table_text(*results.written(name), results.units)
         for name in TABLES
     }
-    return written | {"summary.json": _summary(results, summary)}
+    return written | {"summary.json": json_text(summary_of(results, summary))}
 
 
 def table_text(columns: Sequence[Column], values: dict[str, Any], units: Units) -> str:
@@ -99,20 +99,18 @@ def _pattern(pattern: Pattern | None, units: Units) -> dict[str, float] | None:
     return {name: float(value) for name, value in told.items()}
 
 
-def _summary(results: Results, summary: dict[str, Any]) -> str:
+def summary_of(results: Results, summary: dict[str, Any]) -> dict[str, Any]:
     """The content of summary.json."""
     units = asdict(results.units) | {
         "sigma0": results.units.sigma0 or None,
         "angles": "deg",
     }
-    return json_text(
-        {
-            **summary,
-            "units": units,
-            "pattern": _pattern(results.pattern, results.units),
-            "pairs": [_pair(one) for one in results],
-        }
-    )
+    return {
+        **summary,
+        "units": units,
+        "pattern": _pattern(results.pattern, results.units),
+        "pairs": [_pair(one) for one in results],
+    }
 
 
 def _pair(one: One) -> dict[str, Any]:

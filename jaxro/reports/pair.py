@@ -13,10 +13,8 @@ from rich.table import Table
 
 from ..tables.measured import COORDINATES
 from .model import One, Results
+from .rows import left_out, most_rows, worst
 from .text import number
-
-MOST_ROWS = 40
-"""Longer tables show their worst rows; --out writes all."""
 
 HIGH = 0.95
 """Correlations of elements above this are named."""
@@ -34,7 +32,6 @@ def show(console: Console, results: Results, subtitle: str) -> None:
 
 
 def _show_one(console: Console, one: One, subtitle: str) -> None:
-    units = one.results.units
     console.print(
         f"[bold]Relative orientation of {escape(one.name)}[/bold], {one.count} points"
     )
@@ -42,16 +39,28 @@ def _show_one(console: Console, one: One, subtitle: str) -> None:
     console.print(_verdict(one))
     if one.usable:
         console.print(_elements(one))
-        sigma0, m_q = one.value("sigma0"), one.value("m_q")
-        freedom, rounds = one.value("degrees_of_freedom"), one.value("iterations")
-        accuracy = f"sigma0 {number(sigma0, digits(sigma0))} {units.sigma0}".rstrip()
-        console.print(
-            f"{accuracy}   m_q {number(m_q, digits(m_q))} {units.photo}   "
-            f"{freedom} degree{'s' * (freedom != 1)} of freedom   "
-            f"{rounds} iteration{'s' * (rounds != 1)}"
-        )
+        show_numbers(console, one)
         console.print(_correlations(one))
     _show_points(console, one)
+
+
+def show_elements(console: Console, one: One) -> None:
+    """The elements with their standard deviations, and those highly correlated."""
+    console.print(_elements(one))
+    console.print(_correlations(one))
+
+
+def show_numbers(console: Console, one: One) -> None:
+    """sigma0, m_q, degrees of freedom, iterations, in a line."""
+    units = one.results.units
+    sigma0, m_q = one.value("sigma0"), one.value("m_q")
+    freedom, rounds = one.value("degrees_of_freedom"), one.value("iterations")
+    accuracy = f"sigma0 {number(sigma0, digits(sigma0))} {units.sigma0}".rstrip()
+    console.print(
+        f"{accuracy}   m_q {number(m_q, digits(m_q))} {units.photo}   "
+        f"{freedom} degree{'s' * (freedom != 1)} of freedom   "
+        f"{rounds} iteration{'s' * (rounds != 1)}"
+    )
 
 
 def _elements(one: One) -> Table:
@@ -85,9 +94,7 @@ def _show_points(console: Console, one: One) -> None:
         return
     model, q = one.of_points("points"), residuals["q"]
     front = residuals["in_front"] > 0
-    photo = digits(max(_rms(q), _rms([residuals[v] for v in CORRECTIONS])), 1)
-    extent = _rms([model[axis] for axis in AXES]) or 1.0
-    decimals = max(min(6, 5 - math.floor(math.log10(extent))) - 1, 0)
+    photo, decimals = decimals_of_photo(residuals), decimals_of_model(model)
     heads = ("q", "v xl", "v yl", "v xr", "v yr", "r", *(AXES if one.usable else ()))
     named = f", model X Y Z [{unit_name(units.model)}]" if one.usable else ""
     title = f"y-parallax q and corrections v [{units.photo}], redundancy r{named}"
@@ -102,7 +109,21 @@ def _show_points(console: Console, one: One) -> None:
     left_out(console, one.count, "points, those with the largest |q| shown")
     behind = [one.points[i] for i in np.flatnonzero(~front)]
     if behind:
-        console.print(f"[red]Behind a photo:[/red] {join_names(behind, MOST_ROWS)}")
+        console.print(
+            f"[red]Behind a photo:[/red] {escape(join_names(behind, most_rows()))}"
+        )
+
+
+def decimals_of_photo(residuals: dict[str, Any]) -> int:
+    """Decimals of the residuals of a pair."""
+    corrections = [residuals[v] for v in CORRECTIONS]
+    return digits(max(_rms(residuals["q"]), _rms(corrections)), 1)
+
+
+def decimals_of_model(model: dict[str, Any]) -> int:
+    """Decimals of the coordinates of the model."""
+    extent = _rms([model[axis] for axis in AXES if axis in model]) or 1.0
+    return max(min(6, 5 - math.floor(math.log10(extent))) - 1, 0)
 
 
 def _show_many(console: Console, results: Results, subtitle: str) -> None:
@@ -135,7 +156,7 @@ def _show_many(console: Console, results: Results, subtitle: str) -> None:
         if one.advice:
             by_result[one.result].append(one)
     for result, members in by_result.items():
-        names = join_names([one.name for one in members], 5)
+        names = escape(join_names([one.name for one in members], 5))
         colour = "yellow" if members[0].usable else "red"
         console.print(
             f"[{colour}]{result}[/{colour}] ({len(members)}: {names}): "
@@ -144,9 +165,9 @@ def _show_many(console: Console, results: Results, subtitle: str) -> None:
 
 
 def join_names(names: list[str], most: int) -> str:
-    """At most so many names, for the terminal."""
-    more = ", ..." if len(names) > most else ""
-    return ", ".join(map(escape, names[:most])) + more
+    """At most so many names."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def _cameras(one: One) -> str:
@@ -179,18 +200,6 @@ def table(first: str, *numbers: str, title: str | None = None) -> Table:
             no_wrap=True,
         )
     return rows
-
-
-def worst(rows: list, key) -> list:
-    """At most MOST_ROWS rows, the worst by `key`, in their own order."""
-    kept = {id(row) for row in sorted(rows, key=key)[:MOST_ROWS]}
-    return [row for row in rows if id(row) in kept]
-
-
-def left_out(console: Console, count: int, what: str) -> None:
-    """A line about rows that are not shown."""
-    if count > MOST_ROWS:
-        console.print(f"{MOST_ROWS} of {count} {what}; --out DIR writes all.")
 
 
 def unit_name(unit: str) -> str:

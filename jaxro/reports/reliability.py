@@ -2,6 +2,7 @@
 sentences."""
 
 import numpy as np
+from jaxtyping import Bool
 from rich.console import Console
 from rich.markup import escape
 
@@ -10,11 +11,15 @@ from ..assessment import Pattern
 from ..assessment.reliability import BOUNDS
 from .columns import Units
 from .model import One, Results
-from .pair import digits, left_out, table, unit_name, worst
+from .pair import digits, join_names, table, unit_name
+from .rows import left_out, worst
 from .text import number
 
 DOUBTFUL = 0.05
 """Probability of sigma0 below which it is mentioned."""
+
+RARE = 0.001
+"""The same of a pair among many."""
 
 
 def show(console: Console, results: Results) -> None:
@@ -22,19 +27,17 @@ def show(console: Console, results: Results) -> None:
     should mind; of many what to mind of all together."""
     if len(results) == 1:
         one = One(results, 0)
-        points = _test_columns(one)
+        points = test_columns(one)
         if points:
             _show_points(console, one, points)
         said = sentences(one)
     else:
-        said = pattern_sentences(
-            results.pattern, results.units, " of all pairs together"
-        )
+        said = sentences_of_many(results)
     for sentence in said:
         console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
 
 
-def _test_columns(one: One) -> dict[str, np.ndarray]:
+def test_columns(one: One) -> dict[str, np.ndarray]:
     """The reliability of the points; empty where no point can be tested."""
     if "reliability" not in one.results.of_points:
         return {}
@@ -78,7 +81,7 @@ def sentences(one: One) -> list[str]:
     """What to mind of a usable orientation."""
     if not one.usable:
         return []
-    freedom, points = one.value("degrees_of_freedom"), _test_columns(one)
+    freedom, points = one.value("degrees_of_freedom"), test_columns(one)
     if freedom == 0:
         return ["Five points: no measurement checks another, and no error would show."]
     said = []
@@ -88,10 +91,52 @@ def sentences(one: One) -> list[str]:
             "tested. Measure more points, or "
             "give --sigma."
         )
-    if points:
-        said += _doubt_sigma(one) + _doubt_points(one, points)
+    said += doubts(one)
     said += pattern_sentences(one.pattern, one.results.units)
     return said + _weak_points(one, points)
+
+
+def doubts(one: One) -> list[str]:
+    """What the tests of sigma0 and of the points say against a usable orientation."""
+    points = test_columns(one)
+    return _doubt_sigma(one) + _doubt_points(one, points) if points else []
+
+
+def chance_of_sigma0(one: One) -> float:
+    """The probability of a sigma0 that is farther from 1, where sigma is given."""
+    ratio, freedom = one.value("sigma0"), one.value("degrees_of_freedom")
+    return float(critical_values.global_p(freedom * ratio**2, freedom))
+
+
+def sentences_of_many(results: Results) -> list[str]:
+    """What to mind of all pairs together."""
+    return _doubt_sigma_of_many(results) + pattern_sentences(
+        results.pattern, results.units, " of all pairs together"
+    )
+
+
+def find_too_large(results: Results) -> Bool[np.ndarray, " pair"]:
+    """The usable pairs whose sigma0 is larger than the given sigma allows: of good pairs
+    one in a thousand."""
+    freedom = results.of_pairs["degrees_of_freedom"]
+    ratio = np.nan_to_num(results.of_pairs["sigma0"])
+    if not results.sigma_known:
+        return np.zeros(len(results), bool)
+    some = np.maximum(freedom, 1)
+    chance = np.asarray(critical_values.global_p(some * ratio**2, some))
+    return results.usable & (freedom > 0) & (ratio > 1) & (chance < RARE)
+
+
+def _doubt_sigma_of_many(results: Results) -> list[str]:
+    too_large = int(np.sum(find_too_large(results)))
+    expected = RARE / 2 * len(results)
+    if too_large <= max(3 * expected, 0.5):
+        return []
+    return [
+        f"In {too_large} pairs the coordinates are less accurate than their sigma says "
+        f"(of good pairs {number(expected, 1)} would look like this): sigma is too "
+        "small, or points are wrong, which jaxro clean finds."
+    ]
 
 
 def _weak_points(one: One, points: dict[str, np.ndarray]) -> list[str]:
@@ -139,10 +184,10 @@ def pattern_sentences(pattern: Pattern | None, units: Units, of: str = "") -> li
 
 def _doubt_sigma(one: One) -> list[str]:
     """What the test of sigma0 against the given sigma found."""
-    ratio, freedom = one.value("sigma0"), one.value("degrees_of_freedom")
+    ratio = one.value("sigma0")
     if not one.results.sigma_known:
         return []
-    chance = float(critical_values.global_p(freedom * ratio**2, freedom))
+    chance = chance_of_sigma0(one)
     if chance >= DOUBTFUL:
         return []
     if ratio > 1:
@@ -175,5 +220,5 @@ def _doubt_points(one: One, points: dict[str, np.ndarray]) -> list[str]:
 
 def _list(one: One, those: np.ndarray) -> str:
     names = [one.points[i] for i in np.flatnonzero(those)]
-    some = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
+    some = join_names(names, 10)
     return f"point{'s' * (len(names) > 1)} {some}"

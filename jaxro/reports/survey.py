@@ -4,7 +4,8 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from .pair import left_out, table, worst
+from .pair import table
+from .rows import left_out, worst
 from .survey_files import Done, shares
 from .text import number
 
@@ -21,19 +22,39 @@ SOURCES = {
 
 def show(console: Console, done: Done, title: str) -> None:
     """Heights, traverses, what the errors come from, and what to mind."""
-    named, found = done.named, done.found
-    measured = named.survey.measured
-    p_c = np.asarray(measured.base * measured.photo_side / measured.side)
-    known = sum(origin == "known" for origin in done.origin)
     console.print(
-        f"[bold]Heights over the grid of {escape(title)}[/bold], {named.points} "
-        f"points, {known} of known height"
+        f"[bold]Heights over the grid of {escape(title)}[/bold], {contents_in_words(done)}"
     )
-    console.print(
+    console.print(geometry_in_words(done))
+    show_heights(console, done)
+    show_traverses(console, done)
+    show_shares(console, done)
+    for doubt in doubts(done):
+        console.print(f"[red]Mind:[/red] {escape(doubt)}")
+    for note in notes(done):
+        console.print(f"Mind: {note}", markup=False)
+
+
+def contents_in_words(done: Done) -> str:
+    """How many points there are."""
+    known = sum(origin == "known" for origin in done.origin)
+    return f"{done.named.points} points, {known} of known height"
+
+
+def geometry_in_words(done: Done) -> str:
+    """How the photos were taken."""
+    measured = done.named.survey.measured
+    p_c = np.asarray(measured.base * measured.photo_side / measured.side)
+    return (
         f"H {float(measured.camera_height):g} mm, B {float(measured.base):g} mm, "
-        f"{len(named.squares)} squares, "
+        f"{len(done.named.squares)} squares, "
         f"parallax of the grid {np.min(p_c):.2f} to {np.max(p_c):.2f} mm"
     )
+
+
+def show_heights(console: Console, done: Done) -> None:
+    """Heights with their standard deviations, beside those of the grid alone."""
+    named, found = done.named, done.found
     rows = table(
         "point",
         "height",
@@ -66,12 +87,10 @@ def show(console: Console, done: Done, title: str) -> None:
         named.points,
         "points, those with the largest standard deviations shown",
     )
-    _traverses(console, done)
-    _shares(console, done)
-    _mind(console, done)
 
 
-def _traverses(console: Console, done: Done) -> None:
+def show_traverses(console: Console, done: Done) -> None:
+    """Misclosures of traverses, and sigma0."""
     adjusted = done.found.adjusted
     if adjusted is None:
         return
@@ -113,7 +132,8 @@ def _traverses(console: Console, done: Done) -> None:
     )
 
 
-def _shares(console: Console, done: Done) -> None:
+def show_shares(console: Console, done: Done) -> None:
+    """What the variance of the heights comes from."""
     parts = {
         name: float(np.mean(share)) if share.size else 0.0
         for name, share in shares(done).items()
@@ -126,7 +146,9 @@ def _shares(console: Console, done: Done) -> None:
     console.print(f"Variance of the heights comes from: {told}", markup=False)
 
 
-def _mind(console: Console, done: Done) -> None:
+def doubts(done: Done) -> list[str]:
+    """What the tests found."""
+    said = []
     worst_w = abs(done.suspicious[0].w) if done.suspicious else 0.0
     most = [t for t in done.suspicious if abs(t.w) > worst_w - 1e-6]
     if most:
@@ -139,8 +161,8 @@ def _mind(console: Console, done: Done) -> None:
             if rest
             else ""
         )
-        console.print(
-            f"[red]Mind:[/red] Traverse {escape(named)} has |w| = {worst_w:.1f} where "
+        said.append(
+            f"Traverse {named} has |w| = {worst_w:.1f} where "
             f"{float(done.found.limit):.2f} is allowed: one of its legs is wrong by "
             f"some {sizes} mm, the misclosure "
             f"cannot tell which. Read them again.{also}"
@@ -154,18 +176,23 @@ def _mind(console: Console, done: Done) -> None:
                 done.found.deviations.over_grid,
             )
         )
-        console.print(
-            f"[red]Mind:[/red] The height of {escape(done.named.names[i])} is given as "
-            f"{height:.1f} mm, and read as "
-            f"{read:.1f} ± {sd:.1f} mm."
+        said.append(
+            f"The height of {done.named.names[i]} is given as {height:.1f} mm, and "
+            f"read as {read:.1f} ± {sd:.1f} mm."
         )
+    return said
+
+
+def notes(done: Done) -> list[str]:
+    """What a careful user should know besides."""
+    said = []
     unchecked = [
         f"{t.names} ({t.first} - {t.last})"
         for t in done.traverses
         if not np.isfinite(t.detectable)
     ]
     if unchecked:
-        console.print(f"Mind: Nothing checks {escape(', '.join(unchecked))}.")
+        said.append(f"Nothing checks {', '.join(unchecked)}.")
     free = [
         i for i, origin in enumerate(done.origin) if origin not in ("known", "grid")
     ]
@@ -175,9 +202,9 @@ def _mind(console: Console, done: Done) -> None:
             for a in (done.found.deviations.value, done.found.deviations.over_grid)
         )
         if alone < ours:
-            console.print(
-                f"Mind: By (1) alone these heights would have ± {alone:.2f} mm, not "
-                f"{ours:.2f}. What the traverses "
-                "give for it is a check, and that an error of the camera height or of "
-                "the grid hardly enters."
+            said.append(
+                f"By (1) alone these heights would have ± {alone:.2f} mm, not "
+                f"{ours:.2f}. What the traverses give for it is a check, and that an "
+                "error of the camera height or of the grid hardly enters."
             )
+    return said

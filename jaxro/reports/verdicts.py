@@ -182,18 +182,22 @@ def texts(verdicts: Verdicts, units: Units, summary: dict[str, Any]) -> dict[str
         "pair": table.names[table.owners[rounds.rows]],
         "point": table.points[rounds.rows],
     }
-    pairs = [_summary(verdicts, number) for number in range(len(table.names))]
     return {
         "cleaned.csv": table_text(columns, ordered, units),
         "decisions.csv": table_text(ROUNDS, rounds.columns | named, units),
-        "decisions.json": json_text({**summary, "pairs": pairs}),
+        "decisions.json": json_text(summary_of(verdicts, summary)),
     }
+
+
+def summary_of(verdicts: Verdicts, summary: dict[str, Any]) -> dict[str, Any]:
+    """The content of decisions.json."""
+    number = range(len(verdicts.table.names))
+    return {**summary, "pairs": [_summary(verdicts, k) for k in number]}
 
 
 def _summary(verdicts: Verdicts, number: int) -> dict[str, Any]:
     """What decisions.json says of a pair."""
     table = verdicts.table
-    assert verdicts.rounds is not None
     first, last = np.searchsorted(table.owners[verdicts.rejected], [number, number + 1])
     rejected = verdicts.rejected[first:last]
     together: dict[int, list[str]] = {}
@@ -201,7 +205,8 @@ def _summary(verdicts: Verdicts, number: int) -> dict[str, Any]:
         order = int(verdicts.of_points["order"][row])
         together.setdefault(order, []).append(table.points[row])
     names = [f"{name}_deg" for name in IndependentElements.names]
-    outcome = verdicts.outcomes[number]
+    outcome, rounds = verdicts.outcomes[number], verdicts.rounds
+    by_round = [] if rounds is None else rounds.elements[number]
     return {
         "pair": table.names[number],
         "outcome": outcome,
@@ -212,6 +217,6 @@ def _summary(verdicts: Verdicts, number: int) -> dict[str, Any]:
         "undecided": verdicts.undecided.get(number, []),
         "elements": [
             {"round": k, **dict(zip(names, np.rad2deg(values).tolist(), strict=True))}
-            for k, values in enumerate(verdicts.rounds.elements[number], 1)
+            for k, values in enumerate(by_round, 1)
         ],
     }

@@ -211,12 +211,14 @@ def write(
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def write_file(path: Path, text: str) -> None:
+def write_file(path: Path, content: str | bytes) -> None:
     """The whole file or none. Raises TableError."""
     with telling(path, "a file that can be written"):
         path.absolute().parent.mkdir(parents=True, exist_ok=True)
         with draft_of(path, _hidden(path)) as draft:
-            draft.write_text(text, encoding="utf-8", newline="")
+            draft.write_bytes(
+                content if isinstance(content, bytes) else content.encode()
+            )
 
 
 def _hidden(path: Path) -> Path:

@@ -62,6 +62,7 @@ def test_the_figures_are_those_of_python(tmp_path):
     assert {path.name for path in out.iterdir()} == {
         *("cameras.csv", "stations.csv", "zones.csv", "residuals.csv"),
         *("variants.csv", "corrections.csv", "corrections.png", "residuals.png"),
+        "summary.json",
     }
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in out.glob("*.png"))
 

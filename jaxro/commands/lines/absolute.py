@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
+from ..ending import end
 from . import options as given
-from .ending import end
 
 Model = Annotated[
     Path | None,
@@ -93,7 +93,7 @@ def absolute(
     deviations of all points; check points apart. Exit code 0: usable; 1: the control is
     not enough, or not suitable; 2: bad input, nothing written.
     """
-    from .absolute import Options, run
+    from ..absolute import Options, run
 
     options = Options(
         file=file,

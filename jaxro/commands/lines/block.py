@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from ..tables.whole import is_parquet
+from ...tables.whole import is_parquet
+from ..ending import end
 from . import options as given
-from .ending import end
 
 Control = Annotated[
     Path | None,
@@ -150,8 +150,9 @@ def block(
         Path | None,
         typer.Argument(
             help="Table of pairs as of jaxro orient, CSV or Parquet, with the columns "
-            "left and right (the names of the photos) or pairs named LEFT-RIGHT. Without "
-            "it a simulated block.",
+            "left and right (the names of the photos) or pairs named LEFT-RIGHT; or "
+            "Bundler's FILE.out, or the folder of a COLMAP text model. Without it a "
+            "simulated block.",
             metavar="PAIRS.csv",
             show_default=False,
         ),
@@ -178,17 +179,21 @@ def block(
     models: Models = None,
     seed: Seed = None,
     out: Out = None,
+    report: given.Report = None,
+    plots: given.Plots = None,
+    json: given.Json = False,
     force: given.Force = False,
     parquet: Parquet = False,
 ) -> None:
-    """Join oriented pairs of a strip or block on the ground.
+    """Join the pairs of a strip or block on the ground.
 
     Photos, points and control with standard deviations from the image measurements;
     wrong places and wrong control named. Exit code 0: usable; 1: too much is wrong; 2:
     bad input, nothing written.
     """
-    from .block import Options, run
-    from .request import Options as Measured
+    from ..block import Options, run
+    from ..documents import Documents
+    from ..request import Options as Measured
 
     measured = Measured(
         file=file,
@@ -201,6 +206,7 @@ def block(
         unit=photo_unit,
         out=out,
         force=force,
+        documents=Documents(report, plots, json, force),
         semicolons=semicolons,
     )
     options = Options(

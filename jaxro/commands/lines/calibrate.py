@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
+from ..calibration_models import MODELS, ZONES
+from ..calibration_request import Options
+from ..ending import end
 from . import options as given
-from .calibration_models import MODELS, ZONES
-from .calibration_request import Options
-from .ending import end
 
 Places = Annotated[
     Path | None,
@@ -208,15 +208,19 @@ def calibrate(
     pair: Pairs = None,
     unit: Unit = "px",
     out: Out = None,
+    report: given.Report = None,
+    plots: given.Plots = None,
+    json: given.Json = False,
     force: given.Force = False,
 ) -> None:
-    """Calibrate images by points of known object coordinates.
+    """Find camera and distortion of photos of known points.
 
     Station, tilts, and distortion by zones, a lens or a displacement field, chosen by
     the evidence; several images together, with unknown points. Exit code 0: all usable;
     1: some image not; 2: bad input, nothing written.
     """
-    from .calibrate import run
+    from ..calibrate import run
+    from ..documents import Documents
 
     options = Options(
         file=file,
@@ -242,5 +246,6 @@ def calibrate(
         unit=unit,
         out=out,
         force=force,
+        documents=Documents(report, plots, json, force),
     )
     end(lambda: run(options))

@@ -1,13 +1,14 @@
 """What several commands accept on the command line: one annotated type an argument."""
 
 import enum
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from .. import __version__
-from ..tables.whole import is_parquet
+from ... import __version__
+from ...tables.whole import is_parquet
 
 
 class System(enum.StrEnum):
@@ -49,7 +50,8 @@ Version = Annotated[
 
 COLUMNS = (
     "CSV table with the columns point,x_left,y_left,x_right,y_right (or "
-    "id,xl,yl,xr,yr) and optionally pair, sigma."
+    "id,xl,yl,xr,yr) and optionally pair, sigma; or pairs of other programs: FILE.h5, "
+    "Bundler's FILE.out, the folder of a COLMAP text model."
 )
 
 
@@ -165,6 +167,26 @@ Seed = Annotated[
     typer.Option(help="Seed of the random numbers.", metavar="S", min=0, max=2**63 - 1),
 ]
 
+Report = Annotated[
+    Path | None,
+    typer.Option(
+        help="The whole report as one page for a browser (or .pdf), with pictures.",
+        metavar="FILE.html",
+        show_default=False,
+    ),
+]
+Plots = Annotated[
+    Path | None,
+    typer.Option(help="Folder for pictures.", metavar="DIR", show_default=False),
+]
+Json = Annotated[
+    bool,
+    typer.Option(
+        "--json",
+        help="For programs: the content of summary.json in place of the report.",
+    ),
+]
+
 OrientedFiles = Annotated[
     Path | None,
     typer.Option(
@@ -203,7 +225,7 @@ FalseAlarms = Annotated[
 ]
 
 ForceFile = Annotated[
-    bool, typer.Option("--force", help="Overwrite the file of --out.")
+    bool, typer.Option("--force", help="Overwrite the files of --out and --plot.")
 ]
 
 GridTable = Annotated[
@@ -308,3 +330,11 @@ def large(
                 "it is for Parquet results: add --parquet", param_hint=name
             )
     return wanted
+
+
+def engine_of(name: Engine) -> Callable:
+    """What works on the parts of a large table."""
+    from ..cluster import on_ray
+    from ..journal import here
+
+    return {Engine.local: here, Engine.ray: on_ray}[name]

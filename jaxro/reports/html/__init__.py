@@ -1,0 +1,1 @@
+"""Reports as pages of a browser: one file that needs nothing else."""
