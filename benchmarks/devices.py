@@ -1,11 +1,12 @@
 """`python -m benchmarks.devices`: many pairs on the device that JAX finds, with and
 without what is made for the compiler of a CPU.
 
-Figures of one machine, which stand in no baseline; results.md names the device.
+It prints what `devices.json` holds of each device that was measured, of which results.md
+tells. Only ratios of one device count.
 """
 
 import argparse
-import time
+import json
 from collections.abc import Callable
 from functools import partial
 
@@ -23,49 +24,37 @@ from .workload import aerial
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pairs", type=int, default=1_000_000)
-    parser.add_argument("--cleaned", type=int, default=20_000)
+    parser.add_argument("--pairs", type=int, default=2_000_000)
+    parser.add_argument("--cleaned", type=int, default=50_000)
     given = parser.parse_args()
-    device = jax.devices()[0]
-    print(f"{device.device_kind}, jax {jax.__version__}, float64", flush=True)
+    device = f"{jax.devices()[0].device_kind}, jax {jax.__version__}"
+    rates = {}
     orient = partial(jaxro.orient_batch, select=pose)
     for points in (16, 200):
         pairs = given.pairs * 16 // points
         ours = pair_of(aerial(pairs, points))
-        for name, call in {
-            f"pose, {points} points": partial(ready, orient, ours),
-            f"whole, {points} points": partial(ready, jaxro.orient_batch, ours),
-        }.items():
-            _show(name, call, pairs)
+        pose_alone, whole = partial(orient, ours), partial(jaxro.orient_batch, ours)
+        rates[f"pose, {points} points"] = _rate(pose_alone, pairs)
+        rates[f"whole orientation, {points} points"] = _rate(whole, pairs)
+    ours = pair_of(aerial(given.pairs, 16))
     with xla.plain():
-        ours = pair_of(aerial(given.pairs, 16))
-        _show("pose, 16 points, plain JAX", partial(ready, orient, ours), given.pairs)
+        rates["pose, 16 points, plain JAX"] = _rate(partial(orient, ours), given.pairs)
     ours = pair_of(aerial(given.cleaned, 16))
-    clean = partial(jaxro.clean_batch, ours, PROCEDURES["data-snooping"])
-    _show("data-snooping, 16 points", partial(ready, clean), given.cleaned)
-    clean = partial(jaxro.clean_batch, ours, PROCEDURES["recommended"])
-    _show("recommended, 16 points", partial(ready, clean), given.cleaned)
-    _compare(orient)
+    for name in ("data-snooping", "recommended"):
+        clean = partial(jaxro.clean_batch, ours, PROCEDURES[name])
+        rates[f"{name}, 16 points"] = _rate(clean, given.cleaned)
+    rates["largest difference from the processor"] = _difference(orient)
+    print(json.dumps({device: rates}, indent=2))
 
 
-def _show(name: str, call: Callable, pairs: int) -> None:
-    """The first call, and the median of later ones."""
-    began = time.perf_counter()
-    try:
-        call()
-    except Exception as error:
-        print(f"{name}: failed: {str(error)[:300]}", flush=True)
-        return
-    first = time.perf_counter() - began
-    seconds = median_seconds({name: call}, 3)[name]
-    rate = pairs / seconds / 1e6
-    print(
-        f"{name}: {rate:.3f} million pairs a second, first call {first:.1f} s",
-        flush=True,
-    )
+def _rate(call: Callable, pairs: int) -> float:
+    """Million pairs a second, compilation left out."""
+    ready(call)
+    seconds = median_seconds({"": partial(ready, call)}, 3)[""]
+    return float(f"{pairs / seconds / 1e6:.3g}")
 
 
-def _compare(orient: Callable) -> None:
+def _difference(orient: Callable) -> float:
     """The largest difference of poses from those of the processor."""
     ours = pair_of(aerial(10_000, 16))
     here = jax.tree.map(np.asarray, orient(ours))
@@ -73,7 +62,7 @@ def _compare(orient: Callable) -> None:
         there = jax.tree.map(np.asarray, orient(ours))
     pairs = zip(jax.tree.leaves(here), jax.tree.leaves(there), strict=True)
     most = max(float(np.max(np.abs(a - b))) for a, b in pairs if a.dtype == float)
-    print(f"largest difference from the processor: {most:.2e}")
+    return float(f"{most:.2g}")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ many answers are right. All single figures, times too, stand in baseline.json.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from .metrics import Baseline, Metric
 
 PAGE = Path(__file__).with_name("results.md")
+DEVICES = Path(__file__).with_name("devices.json")
 
 INTRODUCTION = """\
 # What was measured
@@ -50,8 +52,19 @@ def page(baseline: Baseline) -> str:
         rows = [_split(metric) for metric in shown if _section(metric) == section]
         if rows:
             parts += [f"## {title}", _table(rows, folded=section != "answers")]
+    parts += ["## Other devices", _devices()]
     parts += ["## Goals missed", _missed(baseline.metrics)]
     return "\n\n".join(parts) + "\n"
+
+
+def _devices() -> str:
+    """A line for each device that `benchmarks.devices` was run on."""
+    measured = json.loads(DEVICES.read_text(encoding="utf-8"))
+    lines = ["From host memory to host memory, million pairs a second, float64:"]
+    for device, figures in measured.items():
+        told = "; ".join(f"{name} {value:g}" for name, value in figures.items())
+        lines.append(f"* {device}: {told}")
+    return "\n".join([lines[0], "", *lines[1:]])
 
 
 def _earlier(baseline: Baseline) -> list[str]:
