@@ -11,14 +11,20 @@ for (const frame of document.querySelectorAll(".table")) {
     if (typeof a === typeof b) return typeof a === "number" ? a - b : a.localeCompare(b, undefined, { numeric: true });
     return typeof a === "number" ? -1 : 1;
   };
-  frame.querySelectorAll("th").forEach((head, column) => head.addEventListener("click", () => {
+  const sort = (head, column) => {
     const falls = head.getAttribute("aria-sort") === "ascending";
     frame.querySelectorAll("th").forEach(other => other.removeAttribute("aria-sort"));
     head.setAttribute("aria-sort", falls ? "descending" : "ascending");
     const rows = Array.from(body.rows, row => [value(row, column), row]);
     rows.sort((a, b) => falls ? compare(b[0], a[0]) : compare(a[0], b[0]));
     body.append(...rows.map(pair => pair[1]));
-  }));
+  };
+  frame.querySelectorAll("th").forEach((head, column) => {
+    const button = document.createElement("button");
+    button.append(...head.childNodes);
+    head.append(button);
+    button.addEventListener("click", () => sort(head, column));
+  });
   const search = frame.querySelector("input");
   if (search) search.addEventListener("input", () => {
     const words = search.value.toLowerCase().split(/\s+/).filter(Boolean);
