@@ -12,6 +12,7 @@ from typing import Any
 from ..reports.files import json_text
 from ..reports.html.page import Page
 from ..reports.rows import ON_PAGE, showing
+from ..reports.terminal import say_what
 from ..tables import whole
 from ..tables.fields import TableError
 
@@ -61,12 +62,12 @@ class Documents:
         TableError."""
         lines = []
         if self.report is not None:
-            with showing(ON_PAGE):
-                made = page()
-            _write_report(self.report, made)
+            with say_what("Making the report ..."), showing(ON_PAGE):
+                _write_report(self.report, page())
             lines.append(f"Report written to {self.report}\n")
         if self.plots is not None:
-            drawn = pictures()
+            with say_what("Drawing ..."):
+                drawn = pictures()
             if drawn:
                 whole.write(self.plots, drawn, read)
             told = ", ".join(drawn) or "nothing, because nothing can be drawn"

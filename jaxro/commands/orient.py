@@ -178,9 +178,9 @@ def run(options: Options) -> bool:
         with progress(errors, "Orienting", len(job.table.names)) as told:
             results, _ = solve_table(job, told)
         summary = job.summary(results)
+        write_graph = prepare_pose_graph(job)
         written = write(lambda: files.texts(results, summary))
-        written += write_documents(job, results)
-        written += write_pose_graph(job)
+        written += write_documents(job, results) + write_graph()
     if options.documents.json:
         show_json(files.summary_of(results, summary))
         return bool(results.usable.all())
@@ -230,11 +230,13 @@ def writing(options: Options) -> Iterator[Callable[[Texts], str]]:
         yield write
 
 
-def write_pose_graph(job: Job) -> str:
-    """Write the pose graph that is asked for; a line about it."""
+def prepare_pose_graph(job: Job) -> Callable[[], str]:
+    """A function that writes the pose graph that is asked for, and says so in a line.
+    Raises TableError where there is none, before anything is written."""
     options = job.options
-    if options.g2o is None:
-        return ""
+    file = options.g2o
+    if file is None:
+        return lambda: ""
     from .pose_graph import graph_text, write_graph
 
     if options.file is None:
@@ -250,7 +252,7 @@ def write_pose_graph(job: Job) -> str:
         job.task.sigma_known,
         residual=job.task.keywords["residual"],
     )
-    return write_graph(options.g2o, text, told, options.read)
+    return lambda: write_graph(file, text, told, options.read)
 
 
 def write_documents(job: Job, results: Results, cleaned: Cleaned | None = None) -> str:
@@ -267,6 +269,7 @@ def write_documents(job: Job, results: Results, cleaned: Cleaned | None = None) 
         Elements=job.system_name,
         Residuals=options.residual,
         Sigma=known and known.removeprefix("sigma "),
+        Procedure=cleaned and cleaned.in_words,
     )
     return options.documents.write(
         page=lambda: page_of_pairs(results, cleaned, told),

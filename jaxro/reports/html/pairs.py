@@ -60,6 +60,12 @@ class Cleaned:
     procedure: str
     tolerances: Mapping[str, bool | int | float | None]
 
+    @property
+    def in_words(self) -> str:
+        """The procedure with all its numbers."""
+        numbers = [f"{name}={value}" for name, value in self.tolerances.items()]
+        return f"{self.procedure}: {', '.join(numbers)}" if numbers else self.procedure
+
 
 def page_of_pairs(
     results: Results,
