@@ -13,13 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..geometry.camera_axes import SIGNS
 from ..geometry.elements import RelativePose
 from ..orientation.result import Orientation
 from .measured_block import MeasuredBlock
-
-ALONG_Y_AND_Z = np.array([1.0, -1.0, -1.0])
-"""From photo axes (y up, z backward) to those of a camera (y down, z forward)."""
-
 
 PARALLEL = 1e-12
 """Determinant of Σ (1 - d dᵀ) over the cube of the number of photos, below which rays
@@ -89,7 +86,7 @@ def models_of(
     columns = lambda *parts: np.stack([np.asarray(a) for a in parts], axis=-1)
     quaternions = columns(pose.qx, pose.qy, pose.qz, pose.qw)
     base = columns(pose.bx, pose.by, pose.bz)
-    turned = ALONG_Y_AND_Z
+    turned = SIGNS
     axes = turned[:, None] * turned[None]
     variances = np.diagonal(np.asarray(oriented.cofactor), axis1=-2, axis2=-1)
     use = np.asarray(oriented.usable)

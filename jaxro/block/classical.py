@@ -21,9 +21,9 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..adjustment import RESULTS, Term
 from ..adjustment.sparse import SparseAdjustment, adjust_sparse
+from ..geometry.camera_axes import SIGNS
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
-from .chain import ALONG_Y_AND_Z
 from .classical_models import ModelCoordinates
 from .measured_block import Ground
 from .network import Frame, KnownCoordinates, Start, frame_of, known_of, of_coordinate
@@ -237,7 +237,7 @@ def placed(
     w, x, y, z = start.quaternions[models.left].T
     stations = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
     bases = start.centres[models.right] - start.centres[models.left]
-    turns = np.swapaxes(stations, 1, 2) * ALONG_Y_AND_Z
+    turns = np.swapaxes(stations, 1, 2) * SIGNS
     return turns, np.linalg.norm(bases, axis=1)
 
 

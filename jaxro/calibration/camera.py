@@ -32,8 +32,8 @@ class Station(AbstractParameters):
     """Where the camera stood and how it was turned: the projection centre, and the unit
     quaternion of R, object to camera (x to the right, y down, z forward).
 
-    Its six local parameters are half a rotation vector in the camera's axes, which
-    enters as the vector part of a quaternion (1, w/2), and the three coordinates.
+    Its six local parameters are a small rotation vector w in the camera's axes, which
+    enters as the quaternion (1, w/2), and the three coordinates.
     """
 
     quaternion: Float[Array, "*image 4"]

@@ -12,6 +12,7 @@ from ..calibration.distances import DistanceAdjustment, adjust_distances
 from ..calibration.measured_images import FEWEST, find_unreached
 from ..calibration.of_image import of_image
 from ..calibration.starts import NEARLY_FLAT
+from ..plots import map_corrections
 from ..reports import calibration as report
 from ..reports.calibration_files import contents, summary
 from ..reports.calibration_model import (
@@ -20,7 +21,6 @@ from ..reports.calibration_model import (
     ObjectPoints,
     Photo,
     Variant,
-    corrections,
     photo,
     variants,
     zone_names,
@@ -93,7 +93,7 @@ def write_documents(done: Done, options: Options) -> str:
     """Make the report and the pictures that are asked for; a line for each."""
     if not options.documents:
         return ""
-    done = replace(done, maps=[corrections(one) for one in done.cameras])
+    done = with_maps(done)
     told = settings(options, options.read)
     return options.documents.write(
         page=lambda: page_of_calibration(done, told),
@@ -102,12 +102,17 @@ def write_documents(done: Done, options: Options) -> str:
     )
 
 
+def with_maps(done: Done) -> Done:
+    """The calibration with a map of the corrections of each camera."""
+    maps = {one.camera: map_corrections(one.found) for one in done.cameras}
+    return replace(done, maps=maps)
+
+
 def write_texts(
     done: Done, asked: Wanted | None
 ) -> tuple[dict[str, str | bytes], list[str]]:
     """The files by name, and what to warn of."""
-    maps = [corrections(one) for one in done.cameras]
-    done = replace(done, maps=maps)
+    done = with_maps(done)
     texts: dict[str, str | bytes] = dict(contents(done))
     warnings = []
     if asked is not None:

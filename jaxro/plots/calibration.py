@@ -36,11 +36,13 @@ NODES = 15
 class CorrectionMap(NamedTuple):
     """The corrections of a camera on nodes over the measured area, in the measuring
     system and the unit of the image; `deviations` of the distortion, without what errors
-    of the pose imitate; which nodes lie `inside` of the measured places."""
+    of the pose imitate; `total`: with the errors of principal place and focal length,
+    which all places share; which nodes lie `inside` of the measured places."""
 
     places: Float[np.ndarray, "node 2"]
     corrections: Float[np.ndarray, "node 2"]
     deviations: Float[np.ndarray, "node 2"]
+    total: Float[np.ndarray, "node 2"]
     inside: Bool[np.ndarray, " node"]
 
 
@@ -51,7 +53,13 @@ def map_corrections(found: Calibration) -> CorrectionMap:
     upward = np.array([1.0, -1.0 if is_y_down(found) else 1.0])
     at = np.asarray(found.principal) + np.asarray(ideal.places) * upward
     deviations = Program(_deviations, {}, COMPILE_FAST)((found, jnp.asarray(nodes)))
-    return CorrectionMap(nodes, at - nodes, np.asarray(deviations), ideal.inside)
+    return CorrectionMap(
+        places=nodes,
+        corrections=at - nodes,
+        deviations=np.asarray(deviations),
+        total=np.asarray(ideal.deviations),
+        inside=ideal.inside,
+    )
 
 
 def is_y_down(found: Calibration) -> bool:
@@ -134,14 +142,11 @@ def draw_calibration(
     `axes`: both."""
     found.check()
     of = map_corrections(found)
-    return draw_corrections(*of, found, unit=unit, title=title, axes=axes)
+    return draw_corrections(of, found, unit=unit, title=title, axes=axes)
 
 
 def draw_corrections(
-    places: Float[np.ndarray, "node 2"],
-    corrections: Float[np.ndarray, "node 2"],
-    deviations: Float[np.ndarray, "node 2"],
-    inside: Bool[np.ndarray, " node"],
+    of: CorrectionMap,
     found: Calibration,
     *,
     unit: str = "mm",
@@ -149,21 +154,21 @@ def draw_corrections(
     axes: Any = None,
 ) -> Any:
     """The same of a map that has been calculated."""
-    left, right = axes = two_plans_or_new(axes, places)
+    left, right = axes = two_plans_or_new(axes, of.places)
     y_down = is_y_down(found)
     told = lambda what: f"{title}: {what}" if title else what.capitalize()
     common = {"zones_of": found, "unit": unit, "y_down": y_down}
     draw_vectors(
-        places[inside],
-        corrections[inside],
+        of.places[of.inside],
+        of.corrections[of.inside],
         title=told("corrections"),
         axes=left,
         **common,
     )
     draw_uncertainty(
-        places,
-        deviations,
-        inside,
+        of.places,
+        of.deviations,
+        of.inside,
         title=told("standard deviations"),
         axes=right,
         **common,

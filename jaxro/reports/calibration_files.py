@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..plots import CorrectionMap
 from . import files
 from .calibration_model import (
     BROWN,
     Distances,
     Done,
-    Map,
     Photo,
     describe,
     zone_names,
@@ -37,7 +37,9 @@ def tables(done: Done) -> dict[str, list[Row]]:
         "variants.csv": [
             row for name in done.variants for row in _variants(done, name)
         ],
-        "corrections.csv": [row for one in done.maps for row in _corrections(one)],
+        "corrections.csv": [
+            row for name, one in done.maps.items() for row in _corrections(name, one)
+        ],
         "points.csv": _points(done),
         "difference.csv": [row for one in done.differences for row in _map(one)],
         "difference_tests.csv": [_difference(one) for one in done.differences],
@@ -229,10 +231,10 @@ def _variants(done: Done, name: str) -> list[Row]:
     ]
 
 
-def _corrections(one: Map) -> list[Row]:
+def _corrections(camera: str, one: CorrectionMap) -> list[Row]:
     return [
         {
-            "camera": one.camera,
+            "camera": camera,
             "x": float(one.places[k, 0]),
             "y": float(one.places[k, 1]),
             "dx": float(one.corrections[k, 0]),

@@ -15,11 +15,11 @@ from ..adjustment import critical_values as critical
 from ..calibration import Calibration, Comparison, Model, Rectangles, Rings, Whole
 from ..calibration.brown import NAMES as BROWN
 from ..calibration.camera import Station
-from ..calibration.correct import correct
 from ..calibration.distortion import distortion_deviations
 from ..calibration.models import focal_weights
 from ..calibration.results import RESULTS
 from ..calibration.zones import AbstractZones
+from ..plots import CorrectionMap
 from ..tables.images import NamedImages
 from ..xla.programs import Program
 from ..xla.settings import COMPILE_FAST
@@ -27,9 +27,6 @@ from .calibration_tests import Compared, TestedZones
 
 RESULT_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
 """Names of the results by their number."""
-
-NODES = 15
-"""Nodes along each side of a map of corrections."""
 
 LEVEL = 0.05
 """Probability with which residuals without an error exceed their limit."""
@@ -145,22 +142,6 @@ class Variant(NamedTuple):
     """Its score minus that of the best."""
 
 
-class Map(NamedTuple):
-    """The corrections of a camera on a grid over the measured area, in the measuring
-    system and the unit of the image.
-
-    `deviations`: of the distortion, without what errors of the pose imitate; `total`:
-    with the errors of principal place and focal length, which all places share.
-    """
-
-    camera: str
-    places: Float[np.ndarray, "node 2"]
-    corrections: Float[np.ndarray, "node 2"]
-    deviations: Float[np.ndarray, "node 2"]
-    total: Float[np.ndarray, "node 2"]
-    inside: np.ndarray
-
-
 class Distances(NamedTuple):
     """Station and focal lengths by distances."""
 
@@ -261,7 +242,7 @@ class Done:
     variants: dict[str, list[Variant]]
     together: bool
     chosen: bool
-    maps: list[Map] = field(default_factory=list)
+    maps: dict[str, CorrectionMap] = field(default_factory=dict)
     points: ObjectPoints | None = None
     distances: Distances | None = None
     known_has_deviations: bool = False
@@ -319,24 +300,6 @@ def variants(compared: Comparison, sigma: float) -> list[Variant]:
         )
         for k in np.argsort(figures.score, kind="stable")
     ]
-
-
-def corrections(one: Photo) -> Map:
-    """The map of a camera's corrections."""
-    left, top, right, bottom = one.figures.area
-    x, y = np.linspace(left, right, NODES), np.linspace(top, bottom, NODES)
-    nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    ideal = correct(one.found, nodes)
-    upward = np.array([1.0, -1.0 if one.figures.y_down else 1.0])
-    at = one.figures.principal + np.asarray(ideal.places) * upward
-    return Map(
-        camera=one.camera,
-        places=nodes,
-        corrections=np.asarray(at - nodes),
-        deviations=distortion(one.found, nodes),
-        total=np.asarray(ideal.deviations),
-        inside=ideal.inside,
-    )
 
 
 def distortion(found: Calibration, places: np.ndarray) -> np.ndarray:

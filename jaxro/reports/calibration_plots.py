@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import plots
 from ..plots.style import WIDTH
-from .calibration_model import Done, Map, Photo, Variant, corrections, describe
+from .calibration_model import Done, Photo, Variant, describe
 from .calibration_tests import Compared
 
 MOST = 6
@@ -36,20 +36,12 @@ def draw_corrections(done: Done) -> Any:
     """A row for each camera: its corrections, and how well they are known, both among
     the places that were measured."""
     cameras = done.cameras[:MOST]
-    maps = {one.camera: one for one in done.maps}
     figure = plots.new_figure(3.9 * len(cameras))
     rows = figure.subplots(len(cameras), 2, squeeze=False)
     for axes, one in zip(rows, cameras, strict=True):
-        of: Map = maps.get(one.camera) or corrections(one)
+        of = done.maps.get(one.camera) or plots.map_corrections(one.found)
         plots.draw_corrections(
-            of.places,
-            of.corrections,
-            of.deviations,
-            of.inside,
-            one.found,
-            unit=done.unit,
-            title=one.camera,
-            axes=axes,
+            of, one.found, unit=done.unit, title=one.camera, axes=axes
         )
     return figure
 
