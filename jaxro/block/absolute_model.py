@@ -199,18 +199,22 @@ def model_of_pair(
     pose, use = orientation.pose, pair.mask
     one = jnp.ones(())
 
-    def place(step, point, used):
+    def place(step, point, used, roots):
         moved = pose.move(tuple(step[k] for k in range(5)))
         of_point = model_point(pair, moved, moved, one, jnp.zeros(()))
-        return jnp.stack(of_point(tuple(point[k] for k in range(4)), one, used)[0])
+        at = tuple(point[k] for k in range(4))
+        return jnp.stack(of_point(at, one, used, roots)[0])
 
-    def of_point(point, sigma, used):
+    def of_point(point, sigma, used, roots):
         by_pose, by_point = jax.jacfwd(place, argnums=(0, 1))(
-            jnp.zeros(5), jnp.stack(point), used
+            jnp.zeros(5), jnp.stack(point), used, roots
         )
-        return place(jnp.zeros(5), point, used), by_point * sigma, by_pose
+        if roots is not None:
+            by_point = jnp.stack(roots.pull(tuple(by_point.T)), axis=1)
+        return place(jnp.zeros(5), point, used, roots), by_point * sigma, by_pose
 
-    points, own, by_pose = jax.vmap(of_point)(pair.coordinates, pair.sigma, use)
+    measured = pair.coordinates, pair.sigma, use, pair.roots
+    points, own, by_pose = jax.vmap(of_point)(*measured)
     # what is made of zeros is no point: it is masked, or infinitely far
     points = jnp.where(jnp.any(points != 0, axis=1)[:, None], points, jnp.nan)
     made = model(points, ground, ground_sigma=ground_sigma)

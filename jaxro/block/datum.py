@@ -52,7 +52,7 @@ def free_datum(
     """
     number = 6 if has_scale else 7
     centres = np.asarray(begin.centre)
-    middle = np.mean(centres, axis=0)
+    middle, distance_of_points = np.mean(centres, axis=0), np.asarray(distance)
     held = int(np.argmax(np.linalg.norm(centres - middle, axis=1)))
     base = centres - centres[held]
     far = int(np.argmax(np.linalg.norm(base, axis=1)))
@@ -61,7 +61,9 @@ def free_datum(
 
     def of(families: Mapping[str, Any]) -> Datum:
         both = with_room((begin, families["photo"]))
-        moved, rows = Program(_of_photos, {}, COMPILE_FAST)((both, middle, distance))
+        moved, rows = Program(_of_photos, {}, COMPILE_FAST)(
+            (both, middle, distance_of_points)
+        )
         moved, rows = (np.asarray(a)[: len(centres), :number] for a in (moved, rows))
         return Datum(np.moveaxis(rows, 0, 1), np.sum(moved, axis=0), anchors[:number])
 

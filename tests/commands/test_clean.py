@@ -84,7 +84,7 @@ def test_every_row_is_kept_with_its_verdict(cleaned, sample):
     (measured,) = tables.read(sample).pairs
     written = rows(out / "cleaned.csv")
     assert [row["point"] for row in written] == measured.points
-    numbers = [[float(row[c]) for c in tables.NUMBERS] for row in written]
+    numbers = [[float(row[c]) for c in measured.numbers] for row in written]
     np.testing.assert_array_equal(numbers, measured.rows)
     verdicts = {row["point"]: (row["verdict"], row["order"]) for row in written}
     assert verdicts == {
