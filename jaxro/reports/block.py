@@ -312,6 +312,11 @@ def _of_pairs(done: Done) -> list[str]:
     ]
 
 
+def doubts(done: Done) -> list[str]:
+    """What sigma0 and the check points say against a usable block."""
+    return _of_fit(done) + (_beyond(done) if done.checks.names else [])
+
+
 def _of_fit(done: Done) -> list[str]:
     freedom, sigma0 = done.adjusted.degrees_of_freedom, done.adjusted.sigma0
     if freedom == 0 or done.chance >= DOUBTFUL:
@@ -358,6 +363,11 @@ def _of_checks(done: Done) -> list[str]:
             "together, not how accurate new points are. Give some points of the ground "
             "the role check."
         ]
+    return _beyond(done)
+
+
+def _beyond(done: Done) -> list[str]:
+    """The check points that differ by too much."""
     sizes, limit = np.abs(done.checks.w), done.limit_of_checks
     beyond = np.flatnonzero(np.max(sizes, axis=1) > limit)
     if not beyond.size:

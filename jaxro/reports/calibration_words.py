@@ -90,6 +90,16 @@ def chance(sigma0: float, freedom: int) -> float:
     return float(critical.global_p(freedom * sigma0**2, freedom))
 
 
+def has_doubtful_fit(done: Done) -> bool:
+    """Whether residuals of an image contradict the standard deviations given."""
+    found = [one.figures for one in done.photos if one.usable and done.sigma_known]
+    return any(
+        chance(float(f.sigma0), int(f.degrees_of_freedom)) < DOUBTFUL
+        for f in found
+        if int(f.degrees_of_freedom) > 0
+    )
+
+
 def _small(probability: float) -> str:
     return f"{probability:.2g}" if probability > 1e-99 else "below 1e-99"
 

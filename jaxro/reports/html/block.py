@@ -2,6 +2,7 @@
 ground."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ..pair import digits
 from ..rows import most_rows
 from ..text import number
 from . import pictures
-from .page import Block, Facts, Page, Prose, Row, Section, Table
+from .page import Block, Facts, Page, Prose, Row, Section, Table, Tone
 from .recorded import as_prose, record
 
 MEANINGS = (
@@ -59,10 +60,13 @@ def page_of_block(done: Done, settings: Sequence[tuple[str, str]]) -> Page:
             Section("Points", [_points(done)]),
             Section("How each figure is computed", [Facts(MEANINGS)]),
         ]
+    verdict = as_prose(report.verdict(done), markup=True)
+    if done.usable and report.doubts(done):
+        verdict = replace(verdict, tone=Tone.mind)
     return Page(
         title=f"Block of {done.title}",
         about=report.contents_in_words(done),
-        verdict=as_prose(report.verdict(done), markup=True),
+        verdict=verdict,
         mind=report.sentences(done),
         sections=sections,
         settings=settings,

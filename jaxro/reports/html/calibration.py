@@ -7,7 +7,7 @@ from rich.console import Console
 
 from .. import calibration as report
 from ..calibration_model import Done
-from ..calibration_words import sentences
+from ..calibration_words import has_doubtful_fit, sentences
 from . import pictures
 from .page import Block, Facts, Page, Prose, Section, Tone
 from .recorded import record
@@ -18,7 +18,7 @@ MEANINGS = (
      "deviation was given."),
     ("± sd", "From the covariance of the adjustment, times sigma0²; the object points "
      "take part with their own standard deviations."),
-    ("left out", "The error of coordinates that a model has not seen: each point is "
+    ("left out", "The error of coordinates that a model has not seen: each one in turn is "
      "predicted by the adjustment of all others (closed form)."),
     ("behind", "-2 log evidence of a model, behind that of the best: how much less "
      "probable the model is in the light of the measurements. Models within a few units "
@@ -49,6 +49,8 @@ def page_of_calibration(done: Done, settings: Sequence[tuple[str, str]]) -> Page
     ]
     failed = [one for one in done.photos if not one.usable]
     tone = Tone.good if not failed else Tone.bad if not done.cameras else Tone.mind
+    if tone is Tone.good and has_doubtful_fit(done):
+        tone = Tone.mind
     return Page(
         title=f"Calibration of {done.title}",
         about=report.contents_in_words(done),

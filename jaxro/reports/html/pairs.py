@@ -131,7 +131,7 @@ def _consistency(console: Console, one: One) -> None:
 
 
 def _hidden(one: One) -> str:
-    """What an error that no test finds could do, and what no figure here tells."""
+    """What an error that the tests may miss could do, and what no figure here tells."""
     points = reliability.test_columns(one)
     alone = (
         "Standard deviations follow from the scatter of the measurements; a relative "
@@ -149,7 +149,7 @@ def _hidden(one: One) -> str:
     found = number(error, digits(error, 1))
     units = one.results.units
     return (
-        f"An error that no test finds could move Z by up to {size} "
+        f"An error that the tests miss in one case of five could move Z by {size} "
         f"{unit_name(units.model)} (point {one.points[k]}, {found} {units.photo} in "
         f"y). {alone}"
     )
