@@ -7,8 +7,9 @@ from typer.testing import CliRunner
 from jaxro.cli import app
 
 
-def run(*arguments):
-    result = CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
+def run(*arguments, columns=200):
+    environment = {"COLUMNS": str(columns)}
+    result = CliRunner().invoke(app, [*map(str, arguments)], env=environment)
     assert result.exception is None or isinstance(result.exception, SystemExit), (
         result.exception
     )

@@ -1,11 +1,9 @@
 """Strict settings for every test, shapes checked at run time, and the folder of
 measured data."""
 
-import atexit
 import gc
 import os
-import shutil
-import tempfile
+import resource
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from jaxtyping import install_import_hook
 install_import_hook("jaxro", "beartype.beartype")
 
 os.environ["JAXRO_CACHE"] = ""  # no test finds what another one left
+os.environ["JAXRO_QUIET"] = "1"
 # most of the time goes into compiling programs that run once
 cheap = ["backend_optimization_level=0", "cpu_parallel_codegen_split_count=1"]
 # later compilers have no older code generator, and end the process at a name that they
@@ -26,19 +25,18 @@ if tuple(map(int, version("jaxlib").split(".")[:3])) <= (0, 11, 0):
 os.environ["XLA_FLAGS"] = " ".join(
     [os.environ.get("XLA_FLAGS", ""), *(f"--xla_{flag}" for flag in cheap)]
 ).strip()
-# what several tests, or processes they start, compile is compiled once; given a size,
-# JAX locks the folder to write. A folder given by the caller outlives the run.
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxro-tests-")
-    atexit.register(
-        shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True
-    )
-os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(1 << 34)
+# what several tests, or processes they start, compile is compiled once, and kept for the
+# next run; given a size, JAX locks the folder to write, and gives back what is old
+caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(caches / "jaxro-tests"))
+os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(1 << 32)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 import jax  # noqa: E402
+from examples import example  # noqa: E402, F401 (a fixture of all tests)
+from program_budget import Budget  # noqa: E402
 
-from jaxro.xla import settings  # noqa: E402
+from jaxro.xla import programs, settings  # noqa: E402
 
 # what JAX keeps of the programs would be looked through at every collection: a
 # sixteenth of the time
@@ -48,13 +46,36 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+MEMORY = 5 << 30
+"""Bytes above which a process gives back its programs at the end of a file."""
+
+MAPS = 30_000
+"""Pieces of memory above which it does, too: a system allows some 65,000."""
+
+
+def has_room() -> bool:
+    """Whether this process may keep its programs for the next file; not where the
+    system does not tell."""
+    own = Path("/proc/self")
+    if not own.exists():
+        return False
+    pages = int((own / "statm").read_text().split()[1])
+    pieces = (own / "maps").read_bytes().count(b"\n")
+    return pages * resource.getpagesize() < MEMORY and pieces < MAPS
+
+
 @pytest.fixture(scope="module", autouse=True)
 def memory():
-    """Gives back the programs of a file at its end: of all files together they take
-    more than 20 GB."""
+    """Gives back the programs of a file at its end where there are too many of them."""
     yield
-    jax.clear_caches()
-    gc.collect()
+    if not has_room():
+        jax.clear_caches()
+        programs.forget()
+        gc.collect()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(Budget(), "program budget")
 
 
 @pytest.fixture(scope="session")

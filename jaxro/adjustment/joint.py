@@ -135,6 +135,19 @@ class Joint(eqx.Module):
         return jax.jacrev(of_kept)(kept), of_kept(kept)
 
 
+def check_families(
+    terms: tuple[Term, ...], start: Families, eliminate: str | None
+) -> None:
+    """Raises ValueError for terms and families that do not go together."""
+    for name, family in start.items():
+        if any(jnp.ndim(a) == 0 for a in jax.tree.leaves(family)):
+            raise ValueError(
+                f"adjust: the start of family {name!r} has a single number; each number "
+                "of a block is an array over all blocks of the family"
+            )
+    elimination.layout(start, terms, eliminate)
+
+
 def adjust_jointly(
     terms: tuple[Term, ...],
     start: Families,
@@ -150,12 +163,6 @@ def adjust_jointly(
         name: jax.tree.map(lambda a: jnp.asarray(a, float), family)
         for name, family in start.items()
     }
-    for name, family in families.items():
-        if any(jnp.ndim(a) == 0 for a in jax.tree.leaves(family)):
-            raise ValueError(
-                f"adjust: the start of family {name!r} has a single number; each number "
-                "of a block is an array over all blocks of the family"
-            )
     # the optimum does not depend on where it is sought; family by family, because JAX
     # would sort them by name
     families = {

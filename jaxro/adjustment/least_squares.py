@@ -22,9 +22,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..xla.kernels import kernel_part
 from ..xla.passes import pointwise
+from ..xla.programs import compiled, is_traced
 from . import normal_equations as normal
 from .guarded import root, times
-from .joint import adjust_jointly
+from .joint import adjust_jointly, check_families
 from .losses import AbstractLoss
 from .m_estimates import spread
 from .parameters import as_given, as_parameters
@@ -93,17 +94,34 @@ def adjust(
     terms = (terms,) if isinstance(terms, Term) else tuple(terms)
     how = {"loss": loss, "solver": solver, "max_steps": max_steps}
     if terms and all(term.touches for term in terms):
-        return adjust_jointly(
-            terms, start, eliminate=eliminate, constraints=constraints, **how
-        )
+        check_families(terms, start, eliminate)
+        how |= {"eliminate": eliminate, "constraints": constraints}
+        return _as_program(adjust_jointly)(terms, start, **how)
     if len(terms) != 1 or eliminate is not None or constraints is not None:
         raise ValueError(
             "adjust: several terms, `eliminate` and `constraints` are for parameters "
             "in blocks; name the blocks of every term in its `touches`"
         )
+    return _as_program(_adjust_alone)(terms[0], start, **how)
+
+
+def _as_program(function: Callable) -> Callable:
+    """The function of (terms, start, ...) as a program; within a program as it is, for
+    the caller says how that is compiled."""
+    program = compiled(function)
+
+    def call(terms: Any, start: PyTree, **how: Any) -> Any:
+        part = is_traced((terms, start, how))
+        return (function if part else program)(terms, start, **how)
+
+    return call
+
+
+def _adjust_alone(term: Term, start: PyTree, **how: Any) -> Adjustment:
+    """All groups touch all parameters."""
     if as_parameters(start).count > normal.UNROLLED:
-        return _adjust_as_block(terms[0], start, **how)
-    return _adjust_few(terms[0], start, **how)
+        return _adjust_as_block(term, start, **how)
+    return _adjust_few(term, start, **how)
 
 
 def _adjust_few(

@@ -16,10 +16,9 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree, ScalarLike
 
-from ..xla.programs import Program, is_traced
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled, is_traced
 from . import symmetric
 
 Scalar = Float[Array, ""]
@@ -63,9 +62,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     are asked for them; any other residual function is linearised.
     """
 
-    rtol: float = 1e-10
-    atol: float = 1e-14
-    damping: float = 1e-3
+    rtol: ScalarLike = 1e-10
+    atol: ScalarLike = 1e-14
+    damping: ScalarLike = 1e-3
     norm: Callable = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
@@ -93,24 +92,24 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return y, aux, {}
 
 
-def _at_once(function: Callable, data: PyTree, **options: float) -> Any:
+def _at_once(function: Callable, data: PyTree, **options: ScalarLike) -> Any:
     """The function as one program, where the host works between the steps; else as part
     of the caller's."""
     if is_traced(data):
         return function(data, **options)
-    return Program(function, options, COMPILE_FAST)(data)
+    return compiled(function)(data, **options)
 
 
 def _negative(step: PyTree) -> PyTree:
     return jax.tree.map(jnp.negative, step)
 
 
-def _begin(squares: Scalar, damping: float) -> State:
+def _begin(squares: Scalar, damping: ScalarLike) -> State:
     """The state before the first step."""
     one = jnp.ones_like(squares)
     return State(
         squares=squares,
-        damping=damping * one,
+        damping=jnp.multiply(damping, one),
         growth=2 * one,
         decrement=jnp.inf * one,
         done=jnp.zeros((), bool),
@@ -118,7 +117,9 @@ def _begin(squares: Scalar, damping: float) -> State:
 
 
 def _decide(
-    data: tuple[State, DampedStep, PyTree, PyTree, Scalar], rtol: float, atol: float
+    data: tuple[State, DampedStep, PyTree, PyTree, Scalar],
+    rtol: ScalarLike,
+    atol: ScalarLike,
 ) -> tuple[PyTree, State]:
     """Where the search goes on, and how: from the state, the step that is proposed, the
     parameters `y` before and `moved` by it, and the sum of squares there."""

@@ -15,7 +15,7 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, ScalarLike
 
 Values = Float[Array, "..."]
 
@@ -58,7 +58,7 @@ class AbstractLoss(AbstractWeight):
 class Huber(AbstractLoss):
     """s inside the scale, 2 k sqrt(s) - k² outside (Huber 1964)."""
 
-    scale: float = 1.345
+    scale: ScalarLike = 1.345
 
     def rho(self, s):
         k2 = self.scale**2
@@ -70,7 +70,7 @@ class Huber(AbstractLoss):
 class SoftL1(AbstractLoss):
     """2 k² (sqrt(1 + s/k²) - 1)"""
 
-    scale: float = 1.0
+    scale: ScalarLike = 1.0
 
     def rho(self, s):
         # the same without a difference of nearly equal numbers
@@ -81,7 +81,7 @@ class SoftL1(AbstractLoss):
 class Cauchy(AbstractLoss):
     """k² log(1 + s/k²)"""
 
-    scale: float = 2.385
+    scale: ScalarLike = 2.385
 
     def rho(self, s):
         return self.scale**2 * jnp.log1p(s / self.scale**2)
@@ -90,7 +90,7 @@ class Cauchy(AbstractLoss):
 class GemanMcClure(AbstractLoss):
     """s / (1 + s/k²), bounded by k²"""
 
-    scale: float = 2.0
+    scale: ScalarLike = 2.0
 
     def rho(self, s):
         return s / (1 + s / self.scale**2)
@@ -99,7 +99,7 @@ class GemanMcClure(AbstractLoss):
 class Tukey(AbstractLoss):
     """k²/3 (1 - (1 - s/k²)³) inside the scale, k²/3 outside (biweight)."""
 
-    scale: float = 4.685
+    scale: ScalarLike = 4.685
 
     def rho(self, s):
         t = jnp.minimum(s / self.scale**2, 1.0)
@@ -110,7 +110,7 @@ class LeastAbsolute(AbstractWeight):
     """k / sqrt(s) outside the scale k, 1 inside. It minimises Σ |r|; a small k avoids
     infinite weights."""
 
-    scale: float = 0.1
+    scale: ScalarLike = 0.1
 
     def weight(self, s):
         return self.scale / jnp.sqrt(jnp.maximum(s, self.scale**2))
@@ -120,13 +120,13 @@ class Danish(AbstractWeight):
     """1 inside the scale k, exp(-factor (sqrt(s)/k)^power) outside (Krarup, Juhl and
     Kubik 1980, with k of 2 or 3)."""
 
-    scale: float = 2.0
-    factor: float = 0.05
-    power: float = 3.0
+    scale: ScalarLike = 2.0
+    factor: ScalarLike = 0.05
+    power: ScalarLike = 3.0
 
     def weight(self, s):
         k2 = self.scale**2
-        outside = jnp.exp(-self.factor * (s / k2) ** (self.power / 2))
+        outside = jnp.exp(-((s / k2) ** (self.power / 2) * self.factor))
         return jnp.where(s > k2, outside, 1.0)
 
 
@@ -134,10 +134,11 @@ class IggThree(AbstractWeight):
     """1 inside k0, (k0/|r|) ((k1 - |r|) / (k1 - k0))² up to k1, zero beyond (IGG III,
     Yang 1994)."""
 
-    scale: float = 1.5
-    last: float = 4.5
+    scale: ScalarLike = 1.5
+    last: ScalarLike = 4.5
 
     def weight(self, s):
         r = jnp.sqrt(jnp.maximum(s, self.scale**2))
         left = jnp.maximum(self.last - r, 0.0)
-        return self.scale / r * (left / (self.last - self.scale)) ** 2
+        width = jnp.subtract(self.last, self.scale)
+        return self.scale / r * (left / width) ** 2

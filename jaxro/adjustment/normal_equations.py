@@ -18,7 +18,7 @@ import lineax as lx
 import optimistix as optx
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PyTree, ScalarLike
 
 from ..xla.kernels import computed_once, kernel_part
 from ..xla.passes import sums
@@ -227,9 +227,9 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
     linearisation).
     """
 
-    rtol: float = 1e-12
-    atol: float = 1e-12
-    max_step: float = float("inf")
+    rtol: ScalarLike = 1e-12
+    atol: ScalarLike = 1e-12
+    max_step: ScalarLike = float("inf")
     norm: Callable = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
@@ -255,7 +255,9 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
         )
         # a first step tells nothing of how they fall
         rounding = (previous > 0) & (ratio >= 1)
-        predicted = size * jnp.where(rounding, min(1.0, self.atol / ROUNDING), ratio)
+        predicted = size * jnp.where(
+            rounding, jnp.minimum(1.0, self.atol / ROUNDING), ratio
+        )
         return moved, (predicted, size), None
 
     def terminate(self, fn, y, args, options, state, tags):
@@ -343,7 +345,7 @@ def minimise(
 
 
 def steps(
-    residuals: Any, x: tuple[Scalar, ...], count: int, max_step: float
+    residuals: Any, x: tuple[Scalar, ...], count: int, max_step: ScalarLike
 ) -> tuple[Scalar, ...]:
     """A fixed number of Gauss-Newton steps on `residuals.Residuals`, for starts that
     need no convergence test."""

@@ -25,8 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .block_tridiagonal import Levels, arrange
 from .blocks import Families, Steps
 from .elimination import layout
@@ -281,8 +280,7 @@ class _System:
     datum: DatumOf | None
 
     def __call__(self, steps: Steps) -> list[Array]:
-        options = {"data": self.problem.data}
-        return Program(all_residuals, options, COMPILE_FAST)(steps)
+        return all_residuals(steps, self.problem.data)
 
     def damped(self, steps: Steps, damping: Float[Array, ""]) -> DampedStep:
         """What is subtracted from the displacements. Raises `Singular`."""
@@ -295,15 +293,14 @@ class _System:
             begin = roles.begin[k]
             common[name] = c[begin : begin + own[0] * own[1]].reshape(own)
         x, c, common = jax.device_put((x, c, common))
-        back = Program(carry_back, {"data": data}, COMPILE_FAST)
-        y, decrement, spread = back((x, c, carried))
+        y, decrement, spread = carry_back((x, c, carried), data)
         step = {roles.linked: x, roles.eliminated: y, **common}
         whole = {name: step[name] for name in steps}, decrement, damping, spread
-        return Program(_promise, {}, COMPILE_FAST)(whole)
+        return compiled(promised)(*whole)
 
     def further(self, steps: Steps, step: Steps) -> Steps:
         """The displacements followed by a step."""
-        return Program(_further, {}, COMPILE_FAST)((steps, step))
+        return _further(steps, step)
 
     def datum_at(self, steps: Steps) -> Datum:
         """The datum of the displaced families, with rows for the room of the linked
@@ -323,9 +320,7 @@ class _System:
         """The factorised matrix, the reduced system, and what leads back."""
         problem = self.problem
         data, roles = problem.data, problem.roles
-        options = {"data": data, "roles": roles}
-        program = Program(reduce_normals, options, COMPILE_FAST)
-        reduced, carried = program((steps, damping))
+        reduced, carried = reduce_normals(steps, damping, data, roles=roles)
         datum = None if self.datum is None else self.datum_at(steps)
         factored = factorise(reduced, problem.slots, problem.levels, datum)
         return factored, reduced, carried
@@ -399,10 +394,9 @@ def read(found: Minimum, datum: DatumOf | None = None) -> SparseAdjustment:
     freedom += 0 if factored.free is None else len(factored.free.datum.rest)
     q, crossed, corner = factored.select(problem.slots)
     room = np.zeros((roles.slots - len(q), *q.shape[1:]))
-    options = {"data": data, "roles": roles}
     cofactors = np.concatenate([q, room]), crossed, corner
     solved = carried, Solved(*jax.device_put(cofactors))
-    every = Program(read_solution, options, COMPILE_FAST)(solved)
+    every = read_solution(solved, data, roles=roles)
     of_groups = lambda parts: [
         jax.tree.map(lambda a, n=n: np.asarray(a)[:n], part)
         for part, n in zip(parts, problem.groups, strict=True)
@@ -437,12 +431,9 @@ def _origin(problem: Problem) -> Steps:
     return jax.device_put({name: np.zeros(shape) for name, shape in found.items()})
 
 
-def _promise(data: tuple) -> DampedStep:
-    return promised(*data)
-
-
-def _further(both: tuple[Steps, Steps]) -> Steps:
-    return jax.tree.map(jnp.add, *both)
+@compiled
+def _further(steps: Steps, step: Steps) -> Steps:
+    return jax.tree.map(jnp.add, steps, step)
 
 
 def trimmed(families: dict[str, Any], members: dict[str, int]) -> dict[str, Any]:
@@ -455,4 +446,4 @@ def trimmed(families: dict[str, Any], members: dict[str, int]) -> dict[str, Any]
 
 def displaced(data: Data, steps: Steps) -> dict[str, Any]:
     """The families after a displacement, in their standard form."""
-    return Program(displace, {}, COMPILE_FAST)((data.families, steps))
+    return displace(data.families, steps)

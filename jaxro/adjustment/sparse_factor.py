@@ -22,10 +22,17 @@ BEYOND = 1 << 30
 """A slot that there is not."""
 
 
+SMALL, LEAST_ROOM = 1 << 12, 16
+"""Up to so many things the next power of two has room for them, from so many on."""
+
+
 def room_for(number: int) -> int:
-    """Room for a number of things: at most a quarter more, so that problems of nearly
-    the same size share their programs."""
-    step = 1 << max(0, (number - 1).bit_length() - 3)
+    """Room for a number of things, so that problems of nearly the same size share their
+    programs: of many, which take long to work on, at most a quarter more."""
+    octave = max(number - 1, 0).bit_length()
+    if number <= SMALL:
+        return max(LEAST_ROOM, 1 << octave)
+    step = 1 << octave - 3
     return -(-number // step) * step
 
 

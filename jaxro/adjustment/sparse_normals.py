@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.ops import segment_sum
 from jaxtyping import Array, Float, Int
 
+from ..xla.programs import compiled
 from .blocks import Linearised, Steps, linearise, move, normalise, residuals
 from .elimination import inverses
 from .sparse_factor import Carried, Pattern, Reduced
@@ -118,25 +119,26 @@ class Read(NamedTuple):
     shifts: list[Shifts]
 
 
-def displace(data: tuple[dict[str, Any], Steps]) -> dict[str, Any]:
+@compiled
+def displace(families: dict[str, Any], steps: Steps) -> dict[str, Any]:
     """The families after a displacement, in their standard form."""
-    families, steps = data
     return {
         name: normalise(move(family, steps[name])) for name, family in families.items()
     }
 
 
+@compiled
 def all_residuals(steps: Steps, data: Data) -> list[Float[Array, "_ _"]]:
     """The whitened residuals of every term."""
     return [residuals(term, data.families, steps) for term in data.terms]
 
 
+@compiled
 def reduce_normals(
-    at: tuple[Steps, Float[Array, ""]], data: Data, roles: Roles
+    steps: Steps, damping: Float[Array, ""], data: Data, *, roles: Roles
 ) -> tuple[Reduced, Carried]:
     """The normal equations of displaced families, their diagonal larger by the part
     `damping`, after the elimination."""
-    steps, damping = at
     n, of, whole = roles.blocks, data.pattern, _normals(data, steps, roles)
     diagonal = lambda a: jnp.diagonal(a, axis1=-2, axis2=-1)
     diagonals = tuple(map(diagonal, (whole.s[:n], whole.common, whole.v)))
@@ -241,6 +243,7 @@ def _without_points(
     return jax.lax.scan(more, blocks, (of.p, of.q, of.slot))[0]
 
 
+@compiled
 def carry_back(
     step: tuple[Float[Array, "block d"], Float[Array, " c"], Carried], data: Data
 ) -> tuple[Float[Array, "point p"], Float[Array, ""], Float[Array, ""]]:
@@ -260,7 +263,8 @@ def carry_back(
     return y, total(along), total(spread)
 
 
-def read_solution(solved: tuple[Carried, Solved], data: Data, roles: Roles) -> Read:
+@compiled
+def read_solution(solved: tuple[Carried, Solved], data: Data, *, roles: Roles) -> Read:
     """What follows from the cofactors of the linked and common parameters."""
     carried, known = solved
     points = _of_points(carried, known, data.pattern)

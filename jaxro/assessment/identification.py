@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import ndtr
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, ScalarLike
 
 from ..adjustment import critical_values as critical
 from ..adjustment.bisection import bisect
@@ -95,10 +95,10 @@ def identify(
     key: PRNGKeyArray,
     *,
     sigma0: ArrayLike = 1.0,
-    level: float = 0.001,
-    power: float = 0.80,
+    level: ScalarLike = 0.001,
+    power: ScalarLike = 0.80,
     familywise: bool = False,
-    doubt: float = DOUBT,
+    doubt: ScalarLike = DOUBT,
     draws: int = 4096,
 ) -> Identification:
     """The minimal detectable and the minimal identifiable errors of one pair at its
@@ -144,9 +144,9 @@ def chances(
     size: ArrayLike,
     coordinate: int = 3,
     sigma0: ArrayLike = 1.0,
-    level: float = 0.001,
+    level: ScalarLike = 0.001,
     familywise: bool = False,
-    doubt: float = DOUBT,
+    doubt: ScalarLike = DOUBT,
     draws: int = 4096,
 ) -> Chances:
     """What becomes of an error of given size in one point, for every point in turn, by
@@ -181,7 +181,11 @@ def chances(
 
 
 def _judge(
-    known: Normalised, w: Values, own: Bool[Array, "point"], limit: Array, doubt: float
+    known: Normalised,
+    w: Values,
+    own: Bool[Array, "point"],
+    limit: Array,
+    doubt: ScalarLike,
 ) -> tuple[Bool[Array, ""], ...]:
     """Which of the fields of `Chances` happens with these w, if the error is in the
     `own` point: exactly one is True."""
@@ -213,7 +217,7 @@ def _read(pair: Pair, orientation: Orientation) -> _Read:
     return _Read(pair, linear, normalise(linear, pair.mask & orientation.usable))
 
 
-def _limit(known: Normalised, level: float, familywise: bool) -> Float[Array, ""]:
+def _limit(known: Normalised, level: ScalarLike, familywise: bool) -> Float[Array, ""]:
     if familywise:
         return largest_w(level, known)
     return critical.normal(level) + 0 * known.squares
@@ -264,7 +268,7 @@ def _least(
     errors: Float[Array, "draw point"],
     point: Int[Array, ""],
     limit: Array,
-    doubt: float,
+    doubt: ScalarLike,
 ) -> tuple[Float[Array, "draw"], Bool[Array, ""]]:
     """X of every draw, and whether any size of error can be told from one in another
     point."""

@@ -20,8 +20,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from ..xla.programs import Program, is_traced
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled, is_traced
 from .layout_criteria import (
     DELTA0 as DELTA0,
     AbstractCriterion as AbstractCriterion,
@@ -102,11 +101,10 @@ def design(
     }
     arguments = jax.tree.map(number, arguments)
     options = arguments | {"points": points, "starts": starts}
-    if is_traced((key, arguments)):
-        return _design(key, **options)
-    return Program(_design, options, COMPILE_FAST)(key)
+    return _design(key, **options)
 
 
+@compiled
 def _design(key, *, criterion, overlap, points, starts, sigma, start, kept) -> Design:
     box = _Box(*(jnp.asarray(side, float) for side in (overlap.x, overlap.y)))
     kept = () if kept is None else tuple(jnp.asarray(a, float) for a in kept)

@@ -20,6 +20,9 @@ same w, and where it is just detectable the same effect on the elements. Everyth
 of first order, at the measured coordinates.
 """
 
+import dataclasses
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -30,11 +33,10 @@ from ..adjustment import critical_values as critical
 from ..adjustment.critical_values import UNTESTABLE
 from ..adjustment.guarded import ratio
 from ..geometry.linear import Linear, Values, linearise, namespace
-from ..geometry.pairs import Coordinates, Pair, mask_unusable
+from ..geometry.pairs import Coordinates, Pair, mask_unusable, quickly
 from ..orientation.orient import Orientation
 from ..xla.kernels import computed_once
-from ..xla.programs import Program, is_traced
-from ..xla.settings import settings_for
+from ..xla.programs import compiled, is_traced
 from .external_reliability import Effects, effects
 from .internal_reliability import Checks, check, normalised_residuals, tests
 
@@ -247,17 +249,9 @@ def assess(
     if sigma is not None:
         sigma0 = _unit_of(pair, sigma0, sigma)
     sigma0 = None if sigma0 is None else jnp.asarray(sigma0, pair.x_left.dtype)
-    options = {
-        "sigma0": sigma0,
-        "level": level,
-        "power": power,
-        "familywise": familywise,
-    }
-    if is_traced((pair, orientation, sigma0)):
-        return _assess((pair, orientation), **options)
-    return Program(_assess, options, settings_for(pair.x_left.size))(
-        (pair, orientation)
-    )
+    tables = tests(pair.mask.shape[0], sigma0 is not None, level, power, familywise)
+    found = _assess(pair, orientation, sigma0, tables)
+    return dataclasses.replace(found, power=power)
 
 
 def _unit_of(pair: Pair, sigma0: ArrayLike | None, sigma: float) -> float:
@@ -274,19 +268,18 @@ def _unit_of(pair: Pair, sigma0: ArrayLike | None, sigma: float) -> float:
     return sigma
 
 
+@compiled(settings=quickly)
 def _assess(
-    read: tuple[Pair, Orientation],
-    *,
+    pair: Pair,
+    orientation: Orientation,
     sigma0: Array | None,
-    level: float,
-    power: float,
-    familywise: bool,
+    tables: tuple[Array, Array, Array],
 ) -> Reliability:
-    pair, orientation = mask_unusable(read[0])[0], read[1]
+    """All but the power. `tables`: those of `internal_reliability.tests`."""
+    pair, _ = mask_unusable(pair)
     linear = linearise(pair, orientation.pose)
     checks = check(pair, orientation, linear, sigma0)
     use, known = checks.use, sigma0 is not None
-    tables = tests(pair.mask.shape[0], known, level, power, familywise)
     delta, limit, each = (critical.look_up(table, checks.points) for table in tables)
     factors = [b**2 * pair.sigma**2 * linear.weight for b in linear.gradient]
     parts = shown = tuple(factor * checks.redundancy for factor in factors)
@@ -314,7 +307,7 @@ def _assess(
         delta0=delta,
         shown=None if pair.roots is None else shown,
         known=known,
-        power=power,
+        power=math.nan,
     )
 
 

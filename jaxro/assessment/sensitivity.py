@@ -29,8 +29,7 @@ from ..orientation.orient import orient
 from ..orientation.result import Orientation
 from ..orientation.results import is_usable
 from ..xla.passes import total
-from ..xla.programs import Program, is_traced
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled, is_traced
 
 Quantity = Callable[[Orientation], PyTree]
 
@@ -164,7 +163,7 @@ def run(
         if "max_steps" in options and not bool(found.usable):
             # further steps from there might make a failed solution a good one
             options["max_steps"] = 0
-    return Program(function, options | more, COMPILE_FAST)(pair)
+    return compiled(function)(pair, **options, **more)
 
 
 class PointInfluence(NamedTuple):

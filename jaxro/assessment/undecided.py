@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from ..adjustment import critical_values
 from ..adjustment.critical_values import UNTESTABLE
@@ -46,7 +46,7 @@ ROUNDING = 1e-6
 def explanations(
     normalised: Normalised,
     point: Int[Array, ""],
-    doubt: float = DOUBT,
+    doubt: ScalarLike = DOUBT,
     estimated: bool = False,
 ) -> Use:
     """The points whose omission explains the misfit as well as the omission of `point`
@@ -63,7 +63,7 @@ def explanations(
     return normalised.tested & (near | own)
 
 
-def _limit_of_tau(normalised: Normalised, doubt: float) -> Values:
+def _limit_of_tau(normalised: Normalised, doubt: ScalarLike) -> Values:
     """The limit of |w_i|j| for every j, by sigma0 of the residuals without j; infinite
     with one degree of freedom left, where there is no test and all points are named."""
     w, freedom = normalised.w, normalised.freedom - 1
@@ -80,7 +80,7 @@ def undecided_points(
     pose: RelativePose,
     use: Use,
     rejected: Use | None = None,
-    doubt: float = DOUBT,
+    doubt: ScalarLike = DOUBT,
 ) -> Use:
     """The points of which some are wrong, though nothing tells which, after a procedure
     has rejected all but `use`: every rejected point that could change places with one
@@ -167,7 +167,7 @@ def _compare(linear: Linear, use: Use) -> _Exchange:
 def misfit(
     normalised: Normalised,
     limit: Float[Array, ""],
-    doubt: float = DOUBT,
+    doubt: ScalarLike = DOUBT,
     estimated: bool = False,
 ) -> tuple[Values, Use]:
     """|w| of the points (|tau| if sigma0 is `estimated`), and the points of which one

@@ -30,7 +30,8 @@ from ..geometry.linear import Linear, Values, linearise
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import Orientation
 from ..xla.passes import sums, total
-from ..xla.programs import Program, is_traced
+from ..xla.programs import compiled
+from ..xla.settings import RUN_FAST
 
 SURE = 0.5
 """Standard error of a variance, relative to the pooled variance, above which a group
@@ -111,9 +112,7 @@ def estimate(
             f"got {names}"
         )
     options = {"labels": tuple(labels), "size": len(names), "steps": steps}
-    if is_traced((pairs, orientations)):
-        return _estimate((pairs, orientations), **options)
-    return Program(_estimate, options)((pairs, orientations))
+    return _estimate(pairs, orientations, **options)
 
 
 def by_photo(pairs: Pair, orientations: Orientation, *, steps: int = 30) -> Components:
@@ -152,10 +151,15 @@ class _Prior(NamedTuple):
     floor: Array
 
 
+@compiled(settings=RUN_FAST)
 def _estimate(
-    data: tuple[Pair, Orientation], *, labels: tuple[Array, ...], size: int, steps: int
+    pairs: Pair,
+    orientations: Orientation,
+    *,
+    labels: tuple[Array, ...],
+    size: int,
+    steps: int,
 ) -> Components:
-    pairs, orientations = data
     pairs = jax.vmap(lambda p: mask_unusable(p)[0])(pairs)
     pairs = pairs.with_mask(pairs.mask & orientations.usable[:, None])
     equations = _data(pairs, orientations, labels, size).equations

@@ -25,11 +25,11 @@ from ..orientation.result import Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..orientation.verdict import check_plane
 from ..rejection import AbstractProcedure, Rejection
-from ..rejection.base import AbstractDecider, Decision, InStages
+from ..rejection.base import AbstractDecider, Decision, InStages, take_sigma
 from ..rejection.hypotheses import AbstractHypotheses
 from ..rejection.search import Search
 from ..xla.kernels import one_kernel, one_kernel_fusing_points
-from ..xla.programs import Program
+from ..xla.programs import compiled
 from ..xla.settings import (
     FEW,
     MOMENT,
@@ -140,8 +140,8 @@ def orient_slabs(
 ) -> PyTree:
     """read(pair, orientation) of every pair, in NumPy."""
     chunk = _chunk(pairs, split.chunk)
-    options = {"problem": problem, "read": read, "chunk": chunk}
-    program = Program(_orient_slab, options, _settings(pairs))
+    program = _orient_slab.using(_settings(pairs))
+    program = program.bind(problem=problem, read=read, chunk=chunk)
     return spread(pairs, program, split, chunk, report)
 
 
@@ -155,7 +155,6 @@ def orient_slabs_near(
     """The same from the vertical, and for which pairs that fits; `problem.start` is an
     `Auto`."""
     chunk = _chunk(pairs, split.chunk)
-    options = {"problem": problem, "read": read, "chunk": chunk}
     if pairs.x_left.size <= ALONE:
         split = split._replace(threads=split.threads or 1, calls=0)
         kernel, lasting = one_kernel, RUN_FAST | WIDE_VECTORS
@@ -166,9 +165,8 @@ def orient_slabs_near(
             RUN_FAST | WIDE_VECTORS | UNSPLIT_LOOPS,
         )
     kernel = kernel if problem.solver is None else None
-    program = Program(
-        _orient_slab_near, options, _settings(pairs, lasting), kernel=kernel
-    )
+    program = _orient_slab_near.using(_settings(pairs, lasting), kernel)
+    program = program.bind(problem=problem, read=read, chunk=chunk)
     return spread(pairs, program, split, chunk, report)
 
 
@@ -200,6 +198,7 @@ def clean_batch(
     not need.
     """
     host, report = jax.tree.map(np.asarray, double(pairs)), progress or silent
+    procedure, host = take_sigma(procedure, host)
     split = Split(threads, chunk)
     out = clean_in_stages(host, procedure, select, split, report)
     return _finish(out)
@@ -237,8 +236,8 @@ def clean_slabs(
 ) -> PyTree:
     """What is selected of every pair's rejection, in NumPy, by one program."""
     split, chunk = _split_of(procedure, pairs, split)
-    options = {"procedure": procedure, "select": select, "chunk": chunk}
-    program = Program(_clean_slab, options, _settings(pairs))
+    program = _clean_slab.using(_settings(pairs))
+    program = program.bind(procedure=procedure, select=select, chunk=chunk)
     return spread(pairs, program, split, chunk, report)
 
 
@@ -251,8 +250,8 @@ def decide_slabs(
 ) -> Decision:
     """The decisions of a stage, in NumPy."""
     split, chunk = _split_of(stage, pairs, split)
-    options = {"stage": stage, "chunk": chunk}
-    program = Program(_decide_slab, options, settings or _settings(pairs))
+    program = _decide_slab.using(settings or _settings(pairs))
+    program = program.bind(stage=stage, chunk=chunk)
     return spread(pairs, program, split, chunk, report)
 
 
@@ -265,8 +264,8 @@ def conclude_slabs(
 ) -> PyTree:
     """What is selected of the rejections that follow from decisions, in NumPy."""
     chunk = _chunk(pairs, split.chunk)
-    options = {"procedure": procedure, "select": select, "chunk": chunk}
-    program = Program(_conclude_slab, options, _settings(pairs))
+    program = _conclude_slab.using(_settings(pairs))
+    program = program.bind(procedure=procedure, select=select, chunk=chunk)
     return spread((pairs, decision), program, split, chunk)
 
 
@@ -287,9 +286,7 @@ def map_batch(
     ever; `threads=1` avoids that.
     """
     chunk = _chunk(pairs, chunk)
-    program = Program(
-        _map_slab, {"function": function, "chunk": chunk}, _settings(pairs)
-    )
+    program = _map_slab.using(_settings(pairs)).bind(function=function, chunk=chunk)
     host, split = jax.tree.map(np.asarray, pairs), Split(threads, chunk)
     return _finish(spread(host, program, split, chunk, progress or silent))
 
@@ -336,16 +333,19 @@ def _settings(pairs: Any, lasting: dict[str, Any] | None = None) -> dict[str, An
     return RUN_FAST if pairs.x_left.shape[1] > FEW else RUN_FAST | WIDE_VECTORS
 
 
+@compiled(unit="points")
 def _orient_slab(
     pairs: Pair, *, problem: Problem, read: Callable, chunk: int
 ) -> PyTree:
     return map_chunks(lambda pair: read(pair, orient_once(pair, problem)), pairs, chunk)
 
 
+@compiled(unit="points")
 def _map_slab(pairs: Any, *, function: Callable, chunk: int) -> PyTree:
     return map_chunks(function, pairs, chunk)
 
 
+@compiled(unit="points")
 def _orient_slab_near(
     pairs: Pair, *, problem: Problem, read: Callable, chunk: int
 ) -> tuple[PyTree, Array]:
@@ -356,16 +356,19 @@ def _orient_slab_near(
     return map_chunks(one, pairs, chunk)
 
 
+@compiled(unit="points")
 def _clean_slab(
     pairs: Pair, *, procedure: AbstractProcedure, select: Callable, chunk: int
 ) -> PyTree:
     return map_chunks(lambda pair: select(procedure.clean(pair)), pairs, chunk)
 
 
+@compiled(unit="points")
 def _decide_slab(pairs: Pair, *, stage: AbstractDecider, chunk: int) -> Decision:
     return map_chunks(stage.decide, pairs, chunk)
 
 
+@compiled(unit="points")
 def _conclude_slab(
     data: tuple[Pair, Decision], *, procedure: InStages, select: Callable, chunk: int
 ) -> PyTree:

@@ -9,7 +9,7 @@ photos give.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..adjustment import results
 from ..adjustment.guarded import ratio, root, times
 from ..geometry import rotations as rot
-from ..xla.programs import Program, is_traced
+from ..xla.programs import compiled, is_traced
 from ..xla.settings import MOMENT, settings_for
 from .absolute_model import MeasuredModel, Units, units_of
 from .absolute_problem import linearise, solve, sum_squares
@@ -63,19 +63,18 @@ def solutions(measured: MeasuredModel) -> list[AbsoluteOrientation]:
 def _orient(measured: MeasuredModel) -> AbsoluteOrientation:
     """The best solution and the next one, on the first axis of each array."""
     if is_traced(measured):
-        return Program(_fit_and_describe, {})(measured)
+        return _fit_and_describe(measured)
     controlled = np.flatnonzero(np.any(np.asarray(measured.known), axis=1))
     control, whole = _with_room(measured.rows(controlled)), _with_room(measured)
-    settings = [settings_for(len(m.points), MOMENT) for m in (control, whole)]
-    found = Program(fit, {}, settings[0])(control)
-    both = Program(describe, {}, settings[1])((whole, found))
+    both = describe(whole, fit(control))
     shown = lambda a: jnp.asarray(np.asarray(a)[:, : len(measured.points)])
     of_points = lambda o: [getattr(o, name) for name in PER_POINT]
     return eqx.tree_at(of_points, both, replace_fn=shown)
 
 
+@compiled
 def _fit_and_describe(measured: MeasuredModel) -> AbsoluteOrientation:
-    return describe((measured, fit(measured)))
+    return describe(measured, fit(measured))
 
 
 def _with_room(measured: MeasuredModel) -> MeasuredModel:
@@ -124,6 +123,11 @@ class Fit(NamedTuple):
     result: RESULTS
 
 
+def _by_size(measured: MeasuredModel, *_: Any) -> dict[str, Any]:
+    return settings_for(len(measured.points), MOMENT)
+
+
+@compiled(settings=_by_size)
 def fit(measured: MeasuredModel) -> Fit:
     """Adjust a model to its control, from the two best starts."""
     units = units_of(measured)
@@ -201,9 +205,9 @@ def _is_second_better(both: Solved) -> Bool[Array, ""]:
 # what is read from it
 
 
-def describe(data: tuple[MeasuredModel, Fit]) -> AbsoluteOrientation:
+@compiled(settings=_by_size)
+def describe(measured: MeasuredModel, found: Fit) -> AbsoluteOrientation:
     """Elements and all points of a model by both solutions."""
-    measured, found = data
     within, (frame, sigma) = measured.within(found.units), found.units
 
     def one(solved: Solved, sigma0: Array, result: RESULTS) -> AbsoluteOrientation:

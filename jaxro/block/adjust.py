@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,7 @@ from ..adjustment.sparse import (
     with_room,
 )
 from ..calibration.camera import Station
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .bars import Bars, NoBar, bar_terms
 from .datum import free_datum
 from .inner import Inner, InnerParameters, cameras_of, in_photo_units
@@ -100,7 +99,7 @@ class BlockAdjustment:
     def _of_photos(self) -> tuple[np.ndarray, np.ndarray]:
         """Angles, and the covariance of angles and centre of each photo."""
         cofactors = self.adjustment.cofactors["photo"]
-        found = Program(_angles, {}, COMPILE_FAST)((self.stations, cofactors))
+        found = _angles(self.stations, cofactors)
         angles, covariance = (np.array(a) for a in found)
         units = np.array([1.0] * 3 + [self.frame.length] * 3)
         return angles, self.sigma0**2 * covariance * np.outer(units, units)
@@ -207,7 +206,7 @@ class BlockAdjustment:
             own = (np.asarray(self.adjustment.parameters["camera"])[camera],)
         condition = ray_condition(self.inner)
         data = with_room((stations, *own, points, places_of(block)))
-        found = Program(_misfits, {"condition": condition}, COMPILE_FAST)(data)
+        found = _misfits(*data, condition=condition)
         off = np.asarray(found)[: len(photo)] * block.focal[photo, None]
         there = self.numbered.number[block.point] >= 0
         return np.where(there[:, None], off * np.array([-1.0, 1.0]), np.nan)
@@ -414,13 +413,15 @@ def conclude(prepared: Prepared, found: Minimum) -> BlockAdjustment:
     )
 
 
-def _misfits(data: tuple, condition: Callable) -> Float[Array, "ray 2"]:
+@compiled
+def _misfits(*rays: Any, condition: Callable) -> Float[Array, "ray 2"]:
     """The misfit of each ray."""
-    return jax.vmap(condition)(*data)
+    return jax.vmap(condition)(*rays)
 
 
+@compiled
 def _angles(
-    data: tuple[Station, Float[Array, "photo 6 6"]],
+    stations: Station, cofactors: Float[Array, "photo 6 6"]
 ) -> tuple[Float[Array, "photo 3"], Float[Array, "photo 6 6"]]:
     """Angles of all photos, and the cofactors of angles and centre."""
 
@@ -432,7 +433,7 @@ def _angles(
         j = jax.jacfwd(values)(origin)
         return values(origin)[:3], j @ q @ j.T
 
-    return jax.vmap(of_photo)(*data)
+    return jax.vmap(of_photo)(stations, cofactors)
 
 
 def _deviations(covariances: Float[np.ndarray, "some d d"]) -> np.ndarray:

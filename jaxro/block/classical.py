@@ -22,8 +22,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..adjustment import RESULTS, Term
 from ..adjustment.sparse import SparseAdjustment, adjust_sparse
 from ..geometry.camera_axes import SIGNS
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .classical_models import ModelCoordinates
 from .measured_block import Ground
 from .network import Frame, KnownCoordinates, Start, frame_of, known_of, of_coordinate
@@ -125,11 +124,9 @@ class ClassicalAdjustment:
         """The derivatives of ties by all unknowns, in the frame; and of the ground by
         the coordinates of each row."""
         models = self.models
-        data = (
-            self.adjustment.parameters["model"],
-            *jax.device_put((models.model, models.at)),
-        )
-        of_models, turns = map(np.asarray, Program(_by_model, {}, COMPILE_FAST)(data))
+        every = self.adjustment.parameters["model"]
+        found = _by_model(every, models.model, models.at)
+        of_models, turns = map(np.asarray, found)
         row = np.arange(len(models.at))[:, None]
         begin, points = 7 * len(models.left), int(self.number.max()) + 1
         ties = np.zeros((len(models.at), 3, begin + 3 * points))
@@ -252,12 +249,12 @@ def _similarities(models: ModelCoordinates, start: Start, units: Frame) -> Simil
     return Similarity(*jax.device_put((lengths / units.length, quaternions, shift)))
 
 
+@compiled
 def _by_model(
-    data: tuple[Similarity, Int[Array, " row"], Float[Array, "row 3"]],
+    families: Similarity, model: Int[Array, " row"], at: Float[Array, "row 3"]
 ) -> tuple[Float[Array, "row 3 7"], Float[Array, "row 3 3"]]:
     """The derivatives of places on the ground by the parameters of their model, and by
     their coordinates in it."""
-    families, model, at = data
 
     def place(step: Array, at: Array, number: Array) -> Array:
         own = jax.tree.map(lambda a: a[number], families)

@@ -11,14 +11,11 @@ orientation elements of models, and no points. Everything is dense.
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from ..adjustment import RESULTS
 from ..adjustment.normal_equations import SINGULAR
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
 from .adjust import Prepared, prepare_block
 from .conditions_of_block import problem_of
 from .conditions_of_models import Linearised, Problem, advance
@@ -185,8 +182,7 @@ def _solve_linear(
 
 
 def _advance(problem: Problem, corrections: np.ndarray, step: np.ndarray) -> Linearised:
-    data = problem, *jax.device_put((corrections, step))
-    return Program(advance, {}, COMPILE_FAST)(data)
+    return advance(problem, corrections, step)
 
 
 def _assemble(linearised: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

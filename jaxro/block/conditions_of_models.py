@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from ..geometry import rotations as rot
 from ..geometry.elements import RelativePose
+from ..xla.programs import compiled
 from .similarity import Similarity
 
 
@@ -212,12 +213,12 @@ class Linearised(NamedTuple):
     centres: Float[Array, "photo 3 u"]
 
 
+@compiled
 def advance(
-    data: tuple[Problem, Float[Array, " lambda"], Float[Array, " u"]],
+    problem: Problem, corrections: Float[Array, " lambda"], step: Float[Array, " u"]
 ) -> Linearised:
     """A problem with corrections of its measurements (places, then known coordinates)
     and a step of its elements, linearised there."""
-    problem, corrections, step = data
     places, values = problem.measured.places, problem.measured.values
     of_places = corrections[: places.size].reshape(places.shape)
     measured = problem.measured._replace(

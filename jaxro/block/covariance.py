@@ -19,8 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from ..calibration.camera import Station
 from ..geometry import rotations as rot
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .adjust import BlockAdjustment
 from .network import angles_and_centre, photo_axes
 
@@ -90,7 +89,7 @@ def relative_covariance(
         [adjusted.block.photos.index(a) for a in (one_photo, other_photo)]
     )
     both = jax.tree.map(lambda a: np.asarray(a)[numbers], adjusted.stations)
-    found = Program(_relative, {}, COMPILE_FAST)(both)
+    found = _relative(both)
     rotation, base, slope = (np.array(a) for a in found)
     base *= adjusted.frame.length
     slope[3:] *= adjusted.frame.length
@@ -131,7 +130,7 @@ def ask(
             "on one and two known coordinates"
         )
     some = jax.tree.map(lambda a: np.asarray(a)[photo], adjusted.stations)
-    turns = Program(_slopes, {}, COMPILE_FAST)(some)
+    turns = _slopes(some)
     length, size = adjusted.frame.length, 6 * len(photo) + 3 * len(point)
     slope = np.eye(size) * length
     for k, own in enumerate(np.asarray(turns)):
@@ -151,6 +150,7 @@ def _find(
     return np.array([numbers[name] for name in names], int)
 
 
+@compiled
 def _slopes(stations: Station) -> Float[Array, "photo 6 6"]:
     """The derivatives of angles and centre of all photos by their parameters."""
 
@@ -162,6 +162,7 @@ def _slopes(stations: Station) -> Float[Array, "photo 6 6"]:
     return jax.vmap(of_photo)(stations)
 
 
+@compiled
 def _relative(
     both: Station,
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"], Float[Array, "6 12"]]:

@@ -27,8 +27,7 @@ from ..adjustment.sparse import with_room
 from ..adjustment.sparse_factor import Anchor, Datum
 from ..calibration.camera import Station
 from ..geometry import rotations as rot
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 
 
 class Reference(NamedTuple):
@@ -61,21 +60,19 @@ def free_datum(
 
     def of(families: Mapping[str, Any]) -> Datum:
         both = with_room((begin, families["photo"]))
-        moved, rows = Program(_of_photos, {}, COMPILE_FAST)(
-            (both, middle, distance_of_points)
-        )
+        moved, rows = _of_photos(*both, middle, distance_of_points)
         moved, rows = (np.asarray(a)[: len(centres), :number] for a in (moved, rows))
         return Datum(np.moveaxis(rows, 0, 1), np.sum(moved, axis=0), anchors[:number])
 
     return of
 
 
+@compiled
 def _of_photos(
-    data: tuple[tuple[Station, Station], Float[Array, "3"], Float[Array, ""]],
+    begin: Station, now: Station, middle: Float[Array, "3"], distance: Float[Array, ""]
 ) -> tuple[Float[Array, "photo 7"], Float[Array, "photo 7 6"]]:
     """The share of each photo in what the datum asks for, and its derivatives by the
     photo's own parameters."""
-    (begin, now), middle, distance = data
 
     def of_photo(begin: Station, now: Station) -> tuple[Array, Array]:
         def share(step: Array) -> Array:

@@ -27,8 +27,7 @@ from ..adjustment.blocks import Steps
 from ..adjustment.sparse import SparseAdjustment
 from ..adjustment.sparse_normals import Data, all_residuals, origin
 from ..adjustment.terms import Term
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .adjust import BlockAdjustment
 from .covariance import ask
 
@@ -91,12 +90,13 @@ def by_observations(
         raise RuntimeError(
             "the sum of squares has no minimum where it is differentiated"
         )
-    program = Program(_by_observations, {"data": data}, COMPILE_FAST)
     return [
         [
             jax.tree.map(lambda a, n=n: np.asarray(a)[:n], part)
             for part, n in zip(
-                program(_steps(adjustment, own)), problem.groups, strict=True
+                _by_observations(_steps(adjustment, own), data),
+                problem.groups,
+                strict=True,
             )
         ]
         for own in z.T
@@ -117,7 +117,7 @@ def _bend(
 ) -> Float[np.ndarray, " row"]:
     """H z."""
     roles, data = adjustment.problem.roles, adjustment.problem.data
-    found = Program(_times_hessian, {"data": data}, COMPILE_FAST)(_steps(adjustment, z))
+    found = _times_hessian(_steps(adjustment, z), data)
     out = np.zeros_like(z)
     for name, own in found.items():
         begin = roles.place(name)[0]
@@ -130,6 +130,7 @@ def _half_squares(steps: Steps, data: Data) -> Float[Array, ""]:
     return sum((jnp.sum(r**2) for r in all_residuals(steps, data)), jnp.zeros(())) / 2
 
 
+@compiled
 def _times_hessian(z: Steps, data: Data) -> Steps:
     """The derivative of the gradient along z."""
     none = jax.tree.map(jnp.zeros_like, z)
@@ -137,6 +138,7 @@ def _times_hessian(z: Steps, data: Data) -> Steps:
     return jax.jvp(gradient, (none,), (z,))[1]
 
 
+@compiled
 def _by_observations(z: Steps, data: Data) -> list[PyTree]:
     """The derivatives of -∂f/∂x · z by the observations of all terms."""
     none = jax.tree.map(jnp.zeros_like, z)

@@ -1,11 +1,13 @@
 """The calibration of a single image: station, tilts, and distortion by zones, by
 Brown's coefficients or by a displacement field, from object points."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..xla.programs import Program, is_traced
+from ..xla.programs import compiled, is_traced
 from ..xla.settings import MOMENT, settings_for
 from .camera import Camera, Rays
 from .images import Frame, MeasuredImage, frame
@@ -35,21 +37,29 @@ def calibrate(
     """
     model = Model() if model is None else model
     if is_traced((measured, known, model)):
-        return _fit((measured, known, first_fit(measured, known, model.rays)), model)
-    settings = settings_for(measured.mask.size, MOMENT)
-    first = Program(first_start, {"rays": model.rays}, settings)((measured, known))
-    return Program(_fit, {"model": model}, settings)((measured, known, first))
+        return _fit(
+            measured, known, first_fit(measured, known, model.rays), model=model
+        )
+    first = first_start(measured, known, rays=model.rays)
+    return _fit(measured, known, first, model=model)
 
 
-def first_start(data: tuple[MeasuredImage, Known], rays: Rays) -> Start:
+def by_size(measured: MeasuredImage, *_: Any, **__: Any) -> dict[str, Any]:
+    """How to compile for an image of so many points."""
+    return settings_for(measured.mask.size, MOMENT)
+
+
+@compiled(settings=by_size)
+def first_start(measured: MeasuredImage, known: Known, *, rays: Rays) -> Start:
     """`first_fit` as a program that all models share."""
-    measured, known = data
     return first_fit(measured, known, rays)
 
 
-def _fit(data: tuple[MeasuredImage, Known, Start], model: Model) -> Calibration:
+@compiled(settings=by_size)
+def _fit(
+    measured: MeasuredImage, known: Known, first: Start, *, model: Model
+) -> Calibration:
     """The adjustment of a model that begins with the one focal length of `first`."""
-    measured, known, first = data
     given = frame(measured, first.handedness)
     observed = observe(measured, given)
     area = Area(observed.places, measured.mask, given.half_sides, first.principal)

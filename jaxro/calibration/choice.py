@@ -21,8 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from ..adjustment import RESULTS, JointAdjustment, symmetric
 from ..xla.passes import count
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST, MOMENT, settings_for
+from ..xla.programs import compiled
 from .brown import Brown
 from .calibrate import calibrate, first_start, observe
 from .camera import Rays, perspective
@@ -102,10 +101,8 @@ def compare(
     rays = models[0].rays
     if any(model.rays is not rays for model in models):
         raise ValueError("compare: all models have the same rays")
-    settings = settings_for(measured.mask.size, MOMENT)
-    first = Program(first_start, {"rays": rays}, settings)((measured, known))
-    program = Program(_compare, {"models": models}, COMPILE_FAST)
-    return Comparison(models, program((measured, known, first)))
+    first = first_start(measured, known, rays=rays)
+    return Comparison(models, _compare(measured, known, first, models=models))
 
 
 def choose(
@@ -119,22 +116,24 @@ def choose(
     return calibrate(measured, found.best, known), found
 
 
+@compiled(static=("models",))
 def _compare(
-    data: tuple[MeasuredImage, Known, Start], models: tuple[Model, ...]
+    measured: MeasuredImage, known: Known, first: Start, *, models: tuple[Model, ...]
 ) -> Figures:
-    number = 2 * count(data[0].mask)
+    number = 2 * count(measured.mask)
     read = lambda found, padded, sigma: assess(found, padded, sigma, number)
-    return adjust_models(data, models, read)
+    return adjust_models(measured, known, first, models, read)
 
 
 def adjust_models(
-    data: tuple[MeasuredImage, Known, Start],
+    measured: MeasuredImage,
+    known: Known,
+    first: Start,
     models: tuple[Model, ...],
     read: Callable[[JointAdjustment, Padded, Float[Array, ""]], Any],
 ) -> Any:
     """What `read` takes from the adjustment of one image by each model and from the
     standard deviation of a place in the units of the frame."""
-    measured, known, first = data
     given = frame(measured, first.handedness)
     observed = observe(measured, given)
     common = Common(

@@ -25,8 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from ..adjustment import JointAdjustment, symmetric
 from ..xla.passes import count
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .brown import Brown
 from .camera import Camera
 from .choice import Comparison, Figures, assess, evidence, fields_of, plain_models
@@ -99,14 +98,12 @@ def compare_together(
         )
     # one program for all strengths
     alike = tuple(_with_strength(model, 1.0) for model in models)
-    program = Program(adjust_model, {"models": alike}, COMPILE_FAST)
-    begin = Program(approximate, {"rays": models[0].rays}, COMPILE_FAST)(measured)
+    begin = compiled(approximate)(measured, rays=models[0].rays)
     found, figures = [], []
     for k, model in enumerate(models):
         strength = 1.0 if model.field is None else float(model.field.strength)
         for _ in range(ROUNDS):
-            at = jnp.asarray(k), jnp.asarray(strength)
-            tried = program((measured, known, begin, *at))
+            tried = adjust_model(measured, known, begin, k, strength, models=alike)
             if np.isfinite(tried.figures.score):
                 begin = tried.solution
             best = STRENGTHS[int(np.nanargmin(tried.scores))]
@@ -124,12 +121,17 @@ def _with_strength(model: Model, strength: Float[Array, ""] | float) -> Model:
     return dataclasses.replace(model, field=Field(model.field.length, strength))
 
 
+@compiled(static=("models",))
 def adjust_model(
-    data: tuple[MeasuredImages, Known, Approximate, Int[Array, ""], Float[Array, ""]],
+    measured: MeasuredImages,
+    known: Known,
+    begin: Approximate,
+    k: Int[Array, ""],
+    strength: Float[Array, ""],
+    *,
     models: tuple[Model, ...],
 ) -> Tried:
     """The adjustment by model number k, its field of the strength given."""
-    measured, known, begin, k, strength = data
     common = Common(
         places=begin.places,
         area=begin.area,

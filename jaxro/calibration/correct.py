@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..adjustment.guarded import root
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .camera import Camera, Measured, corrected, scale
 from .images import Places
 from .models import field_weights, parameter_weights
@@ -40,20 +39,20 @@ def correct(found: Calibration, places: Float[ArrayLike, "n 2"]) -> Corrected:
     They can be given to `jaxro.pair`, with `focal`, like those of a metric camera.
     Deviations are of first order.
     """
-    places = jnp.asarray(places, float)
-    at, deviations, sigma, focal = Program(_correct, {}, COMPILE_FAST)((found, places))
+    places = np.asarray(places, float)
+    at, deviations, sigma, focal = _correct(found, places)
     return Corrected(
         places=at,
         deviations=deviations,
         sigma=sigma,
-        inside=_among(found, np.asarray(places)),
+        inside=_among(found, places),
         focal=focal,
     )
 
 
-def _correct(data: tuple[Calibration, Float[Array, "n 2"]]) -> tuple[Array, ...]:
+@compiled
+def _correct(found: Calibration, places: Float[Array, "n 2"]) -> tuple[Array, ...]:
     """Places, deviations, sigma and focal length of `Corrected`."""
-    found, places = data
     at, slopes = ideal(found, found.frame.normal_places(places))
     own = found.covariance[6:, 6:]
     variances = jnp.einsum("nci,ij,ncj->nc", slopes, own, slopes)

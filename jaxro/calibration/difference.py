@@ -20,13 +20,11 @@ sigma0², has Fisher's distribution if the distortion is the same.
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
 from ..adjustment import critical_values
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .compared import Compared, compare_rays, prior_deviation
 from .result import Calibration
 
@@ -89,8 +87,8 @@ def difference(
     """
     both = first.check(), second.check()
     nodes = _common_area(both)
-    options = {"first": first, "second": second, "refocused": refocused}
-    found: Compared = Program(compare_rays, options, COMPILE_FAST)(jnp.asarray(nodes))
+    compare = compiled(compare_rays)
+    found: Compared = compare(nodes, first, second, refocused=refocused)
     apart, pose = np.asarray(found.apart), np.asarray(found.pose)
     covariance, patterns = _covariance(found), _patterns(both, found)
     below, variance = _pooled(both)

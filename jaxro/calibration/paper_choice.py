@@ -29,9 +29,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..adjustment import RESULTS, JointAdjustment, critical_values
 from ..adjustment.guarded import times
 from ..xla.passes import count
-from ..xla.programs import Program
-from ..xla.settings import MOMENT, settings_for
-from .calibrate import first_start
+from ..xla.programs import compiled
+from .calibrate import by_size, first_start
 from .choice import Figures, adjust_models, assess
 from .images import MeasuredImage, frame
 from .known import NOTHING, Known
@@ -132,10 +131,8 @@ def choose_as_paper(
     rays = models[0].rays
     if any(model.rays is not rays for model in models):
         raise ValueError("choose_as_paper: all models have the same rays")
-    settings = settings_for(measured.mask.size, MOMENT)
-    first = Program(first_start, {"rays": rays}, settings)((measured, known))
-    program = Program(_adjust_all, {"models": models}, settings)
-    covariances, usable, figures = program((measured, known, first))
+    first = first_start(measured, known, rays=rays)
+    covariances, usable, figures = _adjust_all(measured, known, first, models=models)
     usable = np.asarray(usable)
     if not np.any(usable):
         raise RuntimeError(
@@ -254,12 +251,12 @@ def _least(values: np.ndarray, among: np.ndarray) -> int:
     return int(np.argmin(np.where(among, values, np.inf)))
 
 
+@compiled(settings=by_size, static=("models",))
 def _adjust_all(
-    data: tuple[MeasuredImage, Known, Start], models: tuple[Model, ...]
+    measured: MeasuredImage, known: Known, first: Start, *, models: tuple[Model, ...]
 ) -> tuple[Float[Array, "model p p"], Bool[Array, " model"], Figures]:
     """Of every model the covariance of all parameters in the units of object and image,
     whether it can be used, and its figures."""
-    measured, _, first = data
     given = frame(measured, first.handedness)
     number = 2 * count(measured.mask)
 
@@ -269,7 +266,7 @@ def _adjust_all(
         figures = assess(found, padded, sigma, number)
         return covariance, settled & (found.degrees_of_freedom > 0), figures
 
-    covariances, usable, figures = adjust_models(data, models, read)
+    covariances, usable, figures = adjust_models(measured, known, first, models, read)
     camera = covariances.shape[1] - 6
     units = jnp.concatenate(
         [

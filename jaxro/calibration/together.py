@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..adjustment import JointAdjustment
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .camera import Camera, Measured, Station, misfit
 from .images import Frame
 from .known import NOTHING, Known, prior
@@ -151,15 +150,19 @@ def calibrate_together(
             "a field, or zones of degree 0"
         )
     # where the adjustment begins is a program of its own, which all models share
-    begin = Program(approximate, {"rays": model.rays}, COMPILE_FAST)(measured)
-    static = {"model": model, "free_network": free_network}
-    return Program(_adjust, static, COMPILE_FAST)((measured, begin, known))
+    begin = compiled(approximate)(measured, rays=model.rays)
+    return _adjust(measured, begin, known, model=model, free_network=free_network)
 
 
+@compiled
 def _adjust(
-    data: tuple[MeasuredImages, Approximate, Known], model: Model, free_network: bool
+    measured: MeasuredImages,
+    begin: Approximate,
+    known: Known,
+    *,
+    model: Model,
+    free_network: bool,
 ) -> Together:
-    measured, begin, known = data
     u, area = begin.places, begin.area
     focal, field = focal_weights(model, u, area), field_weights(model, u, area)
     number, zones = measured.cameras, focal.shape[2]

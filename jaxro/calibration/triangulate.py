@@ -25,8 +25,7 @@ from ..adjustment import critical_values, symmetric
 from ..adjustment.guarded import root
 from ..geometry import rotations as rot
 from ..xla.passes import count
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .camera import Camera, Measured, Rays, Station, corrected, scale
 from .images import Frame, Points
 from .models import field_weights, parameter_weights
@@ -155,8 +154,7 @@ def triangulate(
     sights = tuple(map(_sight, calibrations, places, deviations))
     rays = tuple(found.model.rays for found in calibrations)
     freedom = jnp.stack([found.degrees_of_freedom for found in calibrations])
-    program = Program(_intersect_all, {"rays": rays}, COMPILE_FAST)
-    return program((sights, freedom.astype(float)))
+    return _intersect_all(sights, freedom.astype(float), rays=rays)
 
 
 def _sigmas(
@@ -190,11 +188,14 @@ def _sight(found: Calibration, places: Array, sigma: Array) -> Sight:
     )
 
 
+@compiled
 def _intersect_all(
-    data: tuple[tuple[Sight, ...], Float[Array, " image"]], rays: tuple[Rays, ...]
+    sights: tuple[Sight, ...],
+    freedom: Float[Array, " image"],
+    *,
+    rays: tuple[Rays, ...],
 ) -> Triangulated:
     """All points, one by one."""
-    sights, freedom = data
     per_place = lambda s: (s.measured, s.variance, s.use)
 
     def of_point(own) -> dict[str, Any]:

@@ -31,7 +31,8 @@ from ..geometry.coplanarity import fundamental_matrix, linearise
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, pair
 from ..rejection.classification import ENGINE, Found, Verdict, classify, verdict
-from ..xla.programs import Program
+from ..xla.programs import compiled
+from ..xla.settings import RUN_FAST
 from ..xla.slabs import Progress, Split, map_chunks, silent, spread
 from .cameras import NO_RAY, PhotoPoints, camera_matrix, focal_length, to_photo
 from .database import Database, Matches, images_of
@@ -189,18 +190,20 @@ def orient(
         some, pose = _rows_of((pairs, verdicts.pose), again)
         left, right = (_rows_of(points, place[again]) for place in places)
         scale = spread(
-            (some, left, right, pose), Program(_scale_all, {}), ONE_BY_ONE, chunk=1
+            (some, left, right, pose), _scale_all.bind(), ONE_BY_ONE, chunk=1
         )
         some = eqx.tree_at(lambda one: one.sigma, some, sigma * scale)
         new = clean_in_stages(some, ENGINE, verdict, ONE_BY_ONE, silent)
         pairs, verdicts = _with_rows((pairs, verdicts), again, (some, new))
-    return spread((pairs, verdicts), Program(_classify_all, {}), ONE_BY_ONE, chunk=1)
+    return spread((pairs, verdicts), _classify_all.bind(), ONE_BY_ONE, chunk=1)
 
 
+@compiled(settings=RUN_FAST)
 def _classify_all(verdicts: tuple[Pair, Verdict]) -> Found:
     return map_chunks(lambda one: classify(*one), verdicts, 1)
 
 
+@compiled(settings=RUN_FAST)
 def _scale_all(data: tuple) -> Float[Array, "pair match"]:
     return map_chunks(lambda one: scale_by_direction(*one), data, 1)
 

@@ -26,14 +26,12 @@ from ..reports.calibration_model import (
     zone_names,
 )
 from ..reports.html.calibration import page_of_calibration
-from ..reports.terminal import consoles, progress, say_compiling, say_what
+from ..reports.terminal import consoles, progress, say_what
 from ..tables import whole
 from ..tables.examples import calibration as example
 from ..tables.fields import TableError
 from ..tables.images import NamedImages
-from ..xla import programs
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .calibration_request import Options, Task, prepare
 from .calibration_tests import Alone, compare_distortions, tested_zones
 from .corrected import Wanted, corrected_texts, read_wanted
@@ -62,7 +60,6 @@ def run(options: Options) -> bool:
     ):
         task = prepare(options)
         asked = read_wanted(options, task.named)
-        programs.watch(lambda _: say_compiling((len(task.named.image),)))
         with progress(errors, "Calibrating", len(task.named.images)) as told:
             done = calibrate(options, task, told)
         if options.out is not None:
@@ -257,10 +254,8 @@ def calibrate_several(
         else:
             found = calibration.calibrate_together(measured, model, task.known)
             tried = {}
-    one = Program(of_image_number, {}, COMPILE_FAST)
-    photos = [
-        _photo(task, k, one((found, jnp.asarray(k)))) for k in range(len(named.images))
-    ]
+    one = compiled(of_image)
+    photos = [_photo(task, k, one(found, k)) for k in range(len(named.images))]
     fixed = named.deviations == 0
     points = ObjectPoints(
         names=named.points,
@@ -270,11 +265,6 @@ def calibrate_several(
         rays=np.bincount(named.point, minlength=len(named.points)),
     )
     return photos, tried, points
-
-
-def of_image_number(data) -> Calibration:
-    """`of_image` of its arguments as one."""
-    return of_image(*data)
 
 
 def check_reached(named: NamedImages) -> None:

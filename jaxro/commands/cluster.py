@@ -31,7 +31,7 @@ def actor(work: Work) -> type:
         # the work is part of the class, which Ray keeps: an argument could be lost
         # before an actor is started anew
         def __init__(self):
-            store.use(store.default_folder())
+            store.keep_programs()
             self._worker = Worker(work, threads=1)
 
         def __call__(self, batch: dict[str, Any]) -> dict[str, list[str]]:

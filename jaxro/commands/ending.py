@@ -18,12 +18,12 @@ def end(work: Callable[[], bool]) -> None:
     stop at any time.
     """
     from ..reports.terminal import abort, say_compiling, steady_streams
-    from ..xla import programs, store
+    from ..xla import notices, store
 
     with steady_streams() as flush:
         try:
-            programs.watch(say_compiling)
-            store.use(store.default_folder())
+            notices.announce(say_compiling)
+            store.keep_programs()
             good = work()
         except KeyboardInterrupt:
             abort()

@@ -33,7 +33,7 @@ from ..reports.verdicts import (
     without_log,
 )
 from ..tables.measured import CameraPairs, Table, one_pair
-from ..xla.programs import Program
+from ..xla.programs import compiled
 from ..xla.settings import MOMENT, settings_for
 
 RESIDUALS = {"rigorous": coplanarity.rigorous, "parallax": coplanarity.parallax}
@@ -117,8 +117,7 @@ def _orient(
     if plan is None:
         pair = one_pair(pairs, 0)
         orientation = orient(pair, **task.keywords)
-        settings = settings_for(pair.x_left.size, MOMENT)
-        read = Program(_read, {"reader": task.reader}, settings)((pair, orientation))
+        read = _read(pair, orientation, reader=task.reader)
         of_pair, of_points = jax.tree.map(np.asarray, read)
         of_pairs = jax.tree.map(lambda a: a[None], of_pair)
         told(1)
@@ -165,8 +164,13 @@ def _hide(
     return hide("elements", of_pairs, missing), hidden
 
 
-def _read(pair_and_orientation: tuple[Pair, Orientation], *, reader: Reader) -> Any:
-    return reader(*pair_and_orientation)
+def _at_once(pair: Pair, *_: Any, **__: Any) -> dict[str, Any]:
+    return settings_for(pair.x_left.size, MOMENT)
+
+
+@compiled(settings=_at_once)
+def _read(pair: Pair, orientation: Orientation, *, reader: Reader) -> Any:
+    return reader(pair, orientation)
 
 
 def _assess(
@@ -201,11 +205,10 @@ def _assess(
     if plan is not None:
         return map_ragged(task.assessor, pairs, batch_of, plan, threads)
     one = jax.tree.map(lambda a: a[0], batch_of(np.zeros(1, int), len(pairs.x_left)))
-    settings = settings_for(one.x_left.size, MOMENT)
-    found = Program(_assess_one, {"assessor": task.assessor}, settings)(one)
-    return jax.tree.map(np.asarray, found)
+    return jax.tree.map(np.asarray, _assess_one(one, assessor=task.assessor))
 
 
+@compiled(settings=lambda one, **_: settings_for(one.pair.x_left.size, MOMENT))
 def _assess_one(oriented: Oriented, *, assessor: Assessor) -> Any:
     return assessor(oriented)
 

@@ -20,8 +20,7 @@ from ..orientation.result import Orientation
 from ..reports.columns import Column, Units, columns_of, element_names, is_given
 from ..reports.model import Results
 from ..reports.reader import report_elements
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 
 NO_NAMES = Units(photo="", model="", sigma0="")
 """The units of an orientation, which does not know what they are called."""
@@ -68,7 +67,7 @@ def _pair_values(oriented: Orientation) -> dict[str, Any]:
     axes = np.ndim(oriented.usable)
     flat = lambda a: np.reshape(np.asarray(a), (-1, *np.shape(a)[axes:]))
     data = jax.tree.map(flat, (oriented.elements, oriented.cofactor, oriented.sigma0))
-    found, deviations = Program(_report, {}, COMPILE_FAST)(data)
+    found, deviations = _report(*data)
     usable, system = flat(oriented.usable), type(oriented.elements)
     hide = lambda a: np.where(usable, np.ravel(a), np.nan)
     values: dict[str, Any] = {
@@ -85,9 +84,10 @@ def _pair_values(oriented: Orientation) -> dict[str, Any]:
     return values
 
 
-def _report(data: tuple) -> tuple[list, list]:
+@compiled
+def _report(*columns: Any) -> tuple[list, list]:
     """The reported numbers of all pairs and their deviations."""
-    return jax.vmap(report_elements)(*data)
+    return jax.vmap(report_elements)(*columns)
 
 
 def _of_files(table: str, result: Any) -> Any:

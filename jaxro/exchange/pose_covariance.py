@@ -27,8 +27,7 @@ from ..calibration.camera import Station
 from ..geometry.camera_axes import to_camera_axes
 from ..geometry.elements import AbstractElements
 from ..orientation.result import Orientation
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .poses import camera_pose, of_each, station_pose
 from .tangents import CameraPose, Tangent, gtsam
 
@@ -103,8 +102,7 @@ def _parts(
     lengths = np.broadcast_to(np.asarray(length, float), pairs)
     if not np.all(np.isfinite(lengths) & (lengths > 0)):
         raise ValueError(f"a base has a positive length, got {length}")
-    data = orientation.elements, jnp.asarray(lengths)
-    slope = np.array(Program(_slopes, {"tangent": tangent}, COMPILE_FAST)(data))
+    slope = np.array(_slopes(orientation.elements, lengths, tangent=tangent))
     unit = orientation.sigma0 if sigma0 is None else sigma0
     variances = np.asarray(unit, float)[..., None, None] ** 2 * np.asarray(
         orientation.cofactor
@@ -113,8 +111,9 @@ def _parts(
     return slope, variances
 
 
+@compiled
 def _slopes(
-    data: tuple[AbstractElements, Float[Array, "*pairs"]], *, tangent: Tangent
+    elements: AbstractElements, lengths: Float[Array, "*pairs"], *, tangent: Tangent
 ) -> Float[Array, "*pairs 6 6"]:
     """∂ξ / ∂(x, l)"""
 
@@ -127,7 +126,7 @@ def _slopes(
 
         return jax.jacfwd(displacement)(jnp.zeros(6, length.dtype))
 
-    return of_each(of_pair, *data)
+    return of_each(of_pair, elements, lengths)
 
 
 # -------------------------------------------------------------------------------------
@@ -140,13 +139,8 @@ def photo_covariances(
     """Σ of every photo of an adjusted block on the ground, in the order of
     `block.photos`. In a free network that of its datum."""
     frame = adjusted.check().frame
-    data = (
-        adjusted.stations,
-        jnp.asarray(frame.middle, float),
-        jnp.asarray(frame.length, float),
-    )
-    slope = Program(_slopes_of_photos, {"tangent": tangent}, COMPILE_FAST)(data)
-    slope = np.asarray(slope)
+    where = adjusted.stations, frame.middle, frame.length
+    slope = np.asarray(_slopes_of_photos(*where, tangent=tangent))
     q = np.asarray(adjusted.adjustment.cofactors["photo"])
     return adjusted.sigma0**2 * slope @ q @ slope.swapaxes(-1, -2)
 
@@ -160,18 +154,16 @@ def relative_photo_covariance(
     """Where the other camera stands in the axes of the first one, and Σ of this pose,
     by the joint covariance of both photos."""
     found = relative_covariance(adjusted, one_photo, other_photo)
-    data = jnp.asarray(found.rotation), jnp.asarray(found.base)
-    program = Program(_slope_of_relative, {"tangent": tangent}, COMPILE_FAST)
-    slope = np.asarray(program(data))
+    slope = np.asarray(_slope_of_relative(found.rotation, found.base, tangent=tangent))
     pose = CameraPose(*to_camera_axes(found.rotation, found.base))
     return pose, slope @ found.covariance @ slope.T
 
 
+@compiled
 def _slopes_of_photos(
-    data: tuple[Station, Array, Array], *, tangent: Tangent
+    stations: Station, middle: Array, length: Array, *, tangent: Tangent
 ) -> Float[Array, "photo 6 6"]:
     """The derivatives of ξ by the parameters of the photos."""
-    stations, middle, length = data
 
     def of_photo(station: Station) -> Array:
         at = station_pose(station, middle, length)
@@ -181,12 +173,12 @@ def _slopes_of_photos(
     return jax.vmap(of_photo)(stations)
 
 
+@compiled
 def _slope_of_relative(
-    data: tuple[Array, Array], *, tangent: Tangent
+    rotation: Array, base: Array, *, tangent: Tangent
 ) -> Float[Array, "6 6"]:
     """The derivatives of ξ by small angles w about the axes of the first photo, D ->
     exp(w×) D, and by the base."""
-    rotation, base = data
 
     def pose(step: Array) -> CameraPose:
         w = step[:3]

@@ -33,8 +33,7 @@ from ..batches.ragged import Ragged
 from ..geometry import rotations as rot
 from ..geometry.elements import AbstractElements
 from ..orientation.result import Orientation
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 
 MEDIAN = np.pi / 2
 """The variance of a median of many normal errors over that of their mean."""
@@ -127,7 +126,7 @@ def _depths(
         [pairs.x_left, pairs.y_left, pairs.x_right, pairs.y_right], axis=1
     )[rows]
     focal = np.stack([pairs.focal_left, pairs.focal_right], axis=1)[owner]
-    found = Program(_log_depths, {}, COMPILE_FAST)((own, coordinates, focal))
+    found = _log_depths(own, coordinates, focal)
     log, slopes, by_coordinates = (np.asarray(a) for a in found)
     variance = np.sum(by_coordinates**2, axis=2)
     variance *= (unit[owner] * pairs.sigma[rows])[:, None] ** 2
@@ -142,8 +141,9 @@ def _depths(
     return Depths(*(column[ahead] for column in columns))
 
 
+@compiled
 def _log_depths(
-    data: tuple[AbstractElements, Array, Array],
+    elements: AbstractElements, coordinates: Array, focal: Array
 ) -> tuple[Float[Array, "row 2"], Float[Array, "row 2 5"], Float[Array, "row 2 4"]]:
     """Of all rows log λ and log μ, and their derivatives by elements and
     coordinates."""
@@ -153,7 +153,7 @@ def _log_depths(
         at = jnp.zeros(5), coordinates
         return function(*at), *jax.jacfwd(function, argnums=(0, 1))(*at)
 
-    return jax.vmap(of_row)(*data)
+    return jax.vmap(of_row)(elements, coordinates, focal)
 
 
 def log_depth(

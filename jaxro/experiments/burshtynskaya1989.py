@@ -27,14 +27,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..batches.batch import clean_batch
 from ..geometry import mock_pairs
 from ..geometry.mock_pairs import draw_points, noisy, plant
 from ..geometry.pairs import Pair
 from ..rejection import AbstractProcedure, Rejection, TwoStage
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from . import burshtynskaya1989_conclusions as conclusions
 from .burshtynskaya1989_conclusions import Conclusions
 
@@ -189,10 +189,9 @@ def _pairs(
     limits = np.array([CLASSES[name][:2] for name in classes])
     key = jax.random.key(seed)
     keys = jax.random.split(key, variants)
-    drawn = keys, jnp.asarray(errors), jnp.asarray(limits)
+    drawn = keys, errors, limits
     noise_key = jax.random.fold_in(key, 1989)
-    plan = drawn, jnp.asarray(planned.errors), noise_key
-    pairs, wrong = Program(_simulate, {}, COMPILE_FAST)(plan)
+    pairs, wrong = _simulate(drawn, np.asarray(planned.errors), noise_key)
     return pairs, classes, np.asarray(wrong)
 
 
@@ -289,9 +288,9 @@ def _pattern() -> tuple[np.ndarray, np.ndarray]:
     return np.array(names), np.array(errors)
 
 
-def _simulate(plan: tuple):
+@compiled
+def _simulate(drawn: tuple, errors: Array, key: Array):
     """All pairs as a batch, and the wrong points of the variants."""
-    drawn, errors, key = plan
     exact = mock_pairs.mock_pair(mock_pairs.row_layout())
     points = exact.mask.shape
 

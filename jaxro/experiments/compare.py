@@ -21,6 +21,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..batches.batch import clean_batch
 from ..geometry.elements import RelativePose
@@ -28,8 +29,7 @@ from ..geometry.mock_pairs import draw_points, noisy, plant
 from ..geometry.pairs import Pair
 from ..orientation.orient import orient
 from ..rejection import AbstractProcedure
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .calibration import Calibration, adjustable, calibrate, select, set_value
 
 LEAST = 6
@@ -207,13 +207,12 @@ def simulate(
     name = f"{setting.layout} {setting.errors} {setting.size} {use}"
     key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode()))
     keys = jax.random.split(key, trials)
-    plan = exact, keys, jnp.asarray(setting.errors), jnp.asarray(setting.size)
-    pairs, wrong = Program(_simulate, {}, COMPILE_FAST)(plan)
+    pairs, wrong = _simulate(exact, keys, setting.errors, setting.size)
     return pairs, np.asarray(wrong)
 
 
-def _simulate(plan: tuple):
-    exact, keys, errors, size = plan
+@compiled
+def _simulate(exact: Pair, keys: Array, errors: Array, size: Array):
     points = exact.mask.shape
 
     def measure(key):
@@ -232,7 +231,7 @@ def _judge(
 ) -> dict[str, Estimate]:
     """The estimates of a `Score`."""
     kept, order, pose, usable, finished = clean_batch(pairs, procedure, select=select)
-    angle = np.asarray(Program(_angles, {}, COMPILE_FAST)((truth, pose)))
+    angle = np.asarray(_angles(truth, pose))
     mask = np.asarray(pairs.mask)
     out, good = mask & ~np.asarray(kept), mask & ~wrong
     first = np.asarray(order) == 1
@@ -252,10 +251,10 @@ def _judge(
     }
 
 
-def _angles(truth_and_poses: tuple[RelativePose, RelativePose]):
+@compiled
+def _angles(truth: RelativePose, poses: RelativePose):
     """The larger of the angles between the rotations and between the bases, arc
     minutes: 2 asin(chord / 2)."""
-    truth, poses = truth_and_poses
 
     def squared_distance(one, other):
         pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)

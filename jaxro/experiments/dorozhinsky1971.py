@@ -30,8 +30,7 @@ from ..rejection.parallaxes import (
     zero_elements,
 )
 from ..rejection.rounds import element_values
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .dorozhinsky1971_first_order import EQUATIONS, by_the_papers_rule
 
 ERRORS = (0.0, 0, 0, 0, 0, 0, 2.0, 2.2, -2.43, -1.90, 0, 0, 0, 0, -0.60, 2.1)
@@ -151,7 +150,7 @@ class Results:
 
 def run() -> Results:
     """Calculate all of it; the noisy pairs have a fixed seed."""
-    calculated = Program(_calculate, {}, COMPILE_FAST)(jnp.asarray(ERRORS))
+    calculated = _calculate(np.asarray(ERRORS))
     pairs, strict, (parallax, elements), influences = calculated
     q, m_q = map(np.asarray, strict)
     decisions = {
@@ -192,6 +191,7 @@ def run() -> Results:
     )
 
 
+@compiled
 def _calculate(errors: Float[Array, "point"]):
     """All pairs as a batch, their strict solutions, the iterations of table 2, and the
     influences by equation."""

@@ -11,10 +11,10 @@ from ..adjustment.losses import AbstractLoss
 from ..adjustment.terms import Term
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose
-from ..geometry.pairs import Pair, double, mask_unusable, pad, room_for
+from ..geometry.pairs import Pair, double, mask_unusable, pad, quickly, room_for
 from ..xla.kernels import kernels_of_parts, one_kernel
-from ..xla.programs import Program, is_traced
-from ..xla.settings import settings_for
+from ..xla.programs import compiled, is_traced
+from ..xla.settings import RUN_FAST
 from . import starts
 from .describe import Description, describe
 from .problem import FOR_CALLERS, Problem, as_array
@@ -84,13 +84,13 @@ def orient(
     if is_traced((pair, problem)):
         if isinstance(start, starts.Auto):
             problem = problem._replace(tolerance=FOR_CALLERS)
-        return Program(orient_once, {"problem": problem})(pair)
+        whole = compiled(orient_once, settings=RUN_FAST)
+        return whole(pair, problem=problem)
     points = pair.x_left.size
     orientation, asked = _orient_in_parts(pair, problem)
     if bool(asked):
         pair = pad(pair, orientation.parallax.size)
-        program = Program(_check, {}, settings_for(pair.x_left.size))
-        orientation = program((pair, (orientation, asked)))
+        orientation = compiled(check_plane, settings=quickly)(pair, orientation, asked)
     return orientation.first(points)
 
 
@@ -111,17 +111,11 @@ def _run(function: Callable, pair: Pair, problem: Problem, kernel: Callable) -> 
     numbers of points too."""
     if problem.residual in ANY_LENGTH:
         pair = pad(pair, room_for(pair.x_left.size))
-    settings = settings_for(pair.x_left.size)
     # the compiler makes no kernel of a solver of the user's, and none of no points
     as_kernel = problem.solver is None and pair.x_left.size > 0
-    options = {"problem": problem}
-    program = Program(function, options, settings, kernel=kernel if as_kernel else None)
-    return program(pair)
-
-
-def _check(data: tuple[Pair, Unchecked]) -> Orientation:
-    pair, (orientation, asked) = data
-    return check_plane(pair, orientation, asked)
+    chosen = kernel if as_kernel else None
+    program = compiled(function, settings=quickly, kernel=chosen, unit="points")
+    return program(pair, problem=problem)
 
 
 def orient_once(pair: Pair, problem: Problem) -> Orientation:

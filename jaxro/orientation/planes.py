@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, ScalarLike
 
 from ..adjustment.normal_equations import accumulate, solve, steps
 from ..geometry import coplanarity, rotations as rot
@@ -105,7 +105,7 @@ class PlanePoses(NamedTuple):
     exists: Bool[Array, "*pairs"]
 
 
-def poses(pair: Pair, orientation: Oriented, *, limit: float = 4.0) -> PlanePoses:
+def poses(pair: Pair, orientation: Oriented, *, limit: ScalarLike = 4.0) -> PlanePoses:
     """Both orientations of points in a plane, of one pair (`jax.vmap` for batches).
 
     `orientation`: the one that was found. `limit`: distance from the plane, in units of

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, ScalarLike
 
 from ..adjustment.losses import AbstractLoss
 from ..adjustment.terms import Term
@@ -39,7 +39,7 @@ class Problem(NamedTuple):
     start: AbstractStart | AbstractElements = Auto()
     solver: optx.AbstractLeastSquaresSolver | None = None
     max_steps: int | None = None
-    tolerance: float = TOLERANCE
+    tolerance: ScalarLike = TOLERANCE
 
     @property
     def most_steps(self) -> int:

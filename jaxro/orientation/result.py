@@ -2,19 +2,20 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, ScalarLike
 
 from ..adjustment import critical_values
 from ..adjustment.guarded import root, times
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.pairs import Coordinates, Pair, first_points, mask_unusable
-from ..xla.programs import Program, is_traced
+from ..xla.programs import compiled, is_traced
 from ..xla.settings import RUN_FAST, settings_for
 from .results import RESULTS, is_usable
 
@@ -123,7 +124,7 @@ class Orientation(eqx.Module):
         return is_usable(self.result)
 
     def interval(
-        self, confidence: float = 0.95, *, sigma0: ArrayLike | None = None
+        self, confidence: ScalarLike = 0.95, *, sigma0: ArrayLike | None = None
     ) -> Float[Array, "*pairs 5"]:
         """Half widths of the intervals that hold each element with this probability.
 
@@ -142,7 +143,7 @@ class Orientation(eqx.Module):
         return times(self._roots, known[..., None])
 
     def radius(
-        self, confidence: float = 0.95, *, sigma0: ArrayLike | None = None
+        self, confidence: ScalarLike = 0.95, *, sigma0: ArrayLike | None = None
     ) -> Float[Array, "*pairs"]:
         """Of the joint region that holds the five elements with this probability: d of
         them from the adjusted ones, d' C⁻¹ d <= radius², C the covariance a posteriori
@@ -167,12 +168,7 @@ class Orientation(eqx.Module):
     def corrections(self, pair: Pair) -> Coordinates:
         """The corrections v of (x_left, y_left, x_right, y_right) of the oriented pair,
         zero where masked."""
-        data = self.pose, pair
-        if is_traced(data):
-            return _corrections_of(data)
-        many = jnp.ndim(self.sigma0)
-        settings = RUN_FAST if many else settings_for(pair.x_left.size)
-        return Program(_corrections_of, {}, settings)(data)
+        return _corrections_of(self.pose, pair)
 
     def check(self) -> "Orientation":
         """This orientation; raises RuntimeError with advice if any of it is not
@@ -200,10 +196,14 @@ def _describe_pose(pose: RelativePose) -> list[str]:
     ]
 
 
-def _corrections_of(data: tuple[RelativePose, Pair]) -> Coordinates:
-    if data[0].qw.ndim:
-        return jax.vmap(_corrections_of)(data)
-    pose, pair = data
+def _by_size(pose: RelativePose, pair: Pair) -> dict[str, Any]:
+    return RUN_FAST if jnp.ndim(pose.qw) else settings_for(pair.x_left.size)
+
+
+@compiled(settings=_by_size)
+def _corrections_of(pose: RelativePose, pair: Pair) -> Coordinates:
+    if pose.qw.ndim:
+        return jax.vmap(_corrections_of)(pose, pair)
     pair, _ = mask_unusable(pair)
     f = coplanarity.fundamental_matrix(
         *pose.relative(), pair.focal_left, pair.focal_right

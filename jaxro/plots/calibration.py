@@ -4,14 +4,12 @@ maps over the image."""
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..calibration import Calibration, correct
 from ..calibration.distortion import distortion_deviations
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .arrows import ROOM, add_key, draw_arrows, enlargement, side_of
 from .style import (
     BLUE,
@@ -52,7 +50,7 @@ def map_corrections(found: Calibration) -> CorrectionMap:
     ideal = correct(found, nodes)
     upward = np.array([1.0, -1.0 if is_y_down(found) else 1.0])
     at = np.asarray(found.principal) + np.asarray(ideal.places) * upward
-    deviations = Program(_deviations, {}, COMPILE_FAST)((found, jnp.asarray(nodes)))
+    deviations = compiled(distortion_deviations)(found, nodes)
     return CorrectionMap(
         places=nodes,
         corrections=at - nodes,
@@ -65,10 +63,6 @@ def map_corrections(found: Calibration) -> CorrectionMap:
 def is_y_down(found: Calibration) -> bool:
     """Whether y of the image points down."""
     return bool(found.frame.handedness > 0)
-
-
-def _deviations(data):
-    return distortion_deviations(*data)
 
 
 def draw_vectors(

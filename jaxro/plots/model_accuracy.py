@@ -10,8 +10,7 @@ from ..geometry.cofactor_roots import CofactorRoots
 from ..geometry.elements import AbstractElements
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.result import Orientation
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 
 Data = tuple[Pair, AbstractElements, Float[Array, "5 5"]]
 
@@ -29,18 +28,20 @@ def model_covariances(
     mixed term, because the corrected coordinates are independent of the misclosures,
     from which the elements come. `sigma0`: the estimated one if None. Of first order.
     """
-    data = pair, orientation.elements, orientation.cofactor
-    unit, at = Program(_cofactors, {}, COMPILE_FAST)(data)
+    unit, at = _cofactors(pair, orientation.elements, orientation.cofactor)
     model = np.stack([np.asarray(c) for c in orientation.model], axis=-1)
     length = float(np.sum(at * model) / max(np.sum(np.square(at)), 1e-300))
     own = float(orientation.sigma0) if sigma0 is None else sigma0
     return (own * length) ** 2 * np.asarray(unit)
 
 
-def _cofactors(data: Data) -> tuple[Float[Array, "point 3 3"], Float[Array, "point 3"]]:
+@compiled
+def _cofactors(
+    pair: Pair, elements: AbstractElements, q: Float[Array, "5 5"]
+) -> tuple[Float[Array, "point 3 3"], Float[Array, "point 3"]]:
     """Cofactors of the model points with the base of the elements, or a base of 1 where
     these are angles alone; and the points."""
-    pair, elements, q = mask_unusable(data[0])[0], *data[1:]
+    pair, _ = mask_unusable(pair)
     focals = pair.focal_left, pair.focal_right
     zero = (jnp.zeros_like(q[0, 0]),) * 5
 

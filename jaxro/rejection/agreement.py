@@ -13,7 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree, ScalarLike
 
 from ..adjustment import critical_values
 from ..adjustment.normal_equations import cholesky, substitute
@@ -34,7 +34,7 @@ SMALLEST_VARIANCE = 1e-6
 """Smallest variance of a residual, in units of sigma²."""
 
 
-def state_sigma(pair: Pair, sigma: float | None) -> Pair:
+def state_sigma(pair: Pair, sigma: ScalarLike | None) -> Pair:
     """The pair with this standard deviation of its coordinates; its own if None. Raises
     ValueError for a pair whose coordinates have covariances."""
     if sigma is None:
@@ -47,7 +47,7 @@ def state_sigma(pair: Pair, sigma: float | None) -> Pair:
     return dataclasses.replace(pair, sigma=jnp.full_like(pair.sigma, sigma))
 
 
-def familywise_limit(level: float, pair: Pair) -> Float[Array, ""]:
+def familywise_limit(level: ScalarLike, pair: Pair) -> Float[Array, ""]:
     """The value that the largest |w| of a pair without errors exceeds with the
     probability `level`, as if all its tests were independent: the normal value of level
     / n (Bonferroni)."""

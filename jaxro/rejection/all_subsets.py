@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, ScalarLike
 
 from ..adjustment import critical_values
 from ..adjustment.normal_equations import SINGULAR, cholesky, substitute
@@ -46,8 +46,8 @@ class AllSubsets(AbstractProcedure):
     """
 
     most: int = 4
-    level: float = 0.001
-    sigma: float | None = None
+    level: ScalarLike = 0.001
+    sigma: ScalarLike | None = None
     shortlist: int = 8
     iterations: int = 3
     least: int = 6

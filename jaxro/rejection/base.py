@@ -2,19 +2,19 @@
 
 import abc
 import dataclasses
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry.elements import RelativePose
-from ..geometry.pairs import Pair, double, first_points, pad, room_for
+from ..geometry.pairs import Pair, double, first_points, pad, quickly, room_for
 from ..orientation.orient import Orientation
 from ..xla.passes import count
-from ..xla.programs import Program, is_traced
-from ..xla.settings import settings_for
+from ..xla.programs import compiled, is_traced
 
 PointValues = Float[Array, "*pairs point"]
 
@@ -152,17 +152,29 @@ class AbstractProcedure(eqx.Module):
         pair = double(pair)
         points = pair.x_left.size
         if is_traced((pair, self)):
-            program = Program(clean, {"procedure": self}, settings_for(points))
-            return program(pair)
-        pair = pad(pair, room_for(points))
-        settings = settings_for(points)
-        if isinstance(self, InStages):
-            decision = decide_in_turn(self, pair, settings)
-            program = Program(conclude, {"procedure": self}, settings)
-            found = program((pair, decision))
+            return clean(pair, procedure=self)
+        procedure, pair = take_sigma(self, pad(pair, room_for(points)))
+        if isinstance(procedure, InStages):
+            decision = decide_in_turn(procedure, pair)
+            found = conclude(pair, decision, procedure=procedure)
         else:
-            found = Program(clean, {"procedure": self}, settings)(pair)
+            found = clean(pair, procedure=procedure)
         return found.first(points)
+
+
+def take_sigma(
+    procedure: AbstractProcedure, pair: Pair
+) -> tuple[AbstractProcedure, Pair]:
+    """The procedure without a sigma of its own, and the pair (or pairs) with it: one
+    program serves those that state a sigma and those that take that of the pair."""
+    sigma = getattr(procedure, "sigma", None)
+    if sigma is None or pair.roots is not None:
+        return procedure, pair  # that both state one is told by the procedure
+    own = np.asarray(pair.sigma)
+    usable = np.isfinite(own) & (own > 0)  # others say that a point is none
+    stated = np.where(usable, np.asarray(sigma, own.dtype), own)
+    procedure = dataclasses.replace(procedure, sigma=None)  # pyright: ignore[reportCallIssue]
+    return procedure, dataclasses.replace(pair, sigma=stated)
 
 
 class Decision(NamedTuple):
@@ -198,29 +210,30 @@ class InStages(Protocol):
         ...
 
 
-def decide_in_turn(
-    procedure: InStages, pair: Pair, settings: dict[str, Any]
-) -> Decision:
+def decide_in_turn(procedure: InStages, pair: Pair) -> Decision:
     """The decision of the first stage that is believed, or else of the last."""
     first, *others = procedure.separate()
-    decision = Program(decide, {"stage": first}, settings)(pair)
+    decision = decide(pair, stage=first)
     for stage in others:
         if bool(decision.believed):
             break
-        decision = Program(decide, {"stage": stage}, settings)(pair)
+        decision = decide(pair, stage=stage)
     return decision
 
 
+@compiled(settings=quickly, unit="points")
 def clean(pair: Pair, *, procedure: AbstractProcedure) -> Rejection:
     """The result for one pair, as a program."""
     return procedure.clean(pair)
 
 
+@compiled(settings=quickly, unit="points")
 def decide(pair: Pair, *, stage: AbstractDecider) -> Decision:
     """The decision of a stage, as a program."""
     return stage.decide(pair)
 
 
-def conclude(data: tuple[Pair, Decision], *, procedure: InStages) -> Rejection:
+@compiled(settings=quickly, unit="points")
+def conclude(pair: Pair, decision: Decision, *, procedure: InStages) -> Rejection:
     """The conclusion of a procedure, as a program."""
-    return procedure.conclude(*data)
+    return procedure.conclude(pair, decision)

@@ -2,7 +2,7 @@
 
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, ScalarLike
 
 from ..adjustment import critical_values
 from ..assessment.correlations import Normalised, normalise
@@ -42,13 +42,13 @@ class DataSnooping(AbstractProcedure):
     `assessment.undecided`); with 1 the largest |w| always goes.
     """
 
-    level: float = 0.001
-    sigma: float | None = None
+    level: ScalarLike = 0.001
+    sigma: ScalarLike | None = None
     estimated: bool = False
     familywise: bool = False
     least: int = 6
     start: AbstractStart = Vertical()
-    doubt: float = DOUBT
+    doubt: ScalarLike = DOUBT
 
     def clean(self, pair: Pair) -> Rejection:
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)

@@ -13,7 +13,7 @@ rejects good points in place of wrong ones in table 1 of the paper.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, ScalarLike
 
 from ..geometry.elements import AbstractElements
 from ..geometry.pairs import Pair, mask_unusable
@@ -68,10 +68,10 @@ class Dorozhinsky(AbstractProcedure):
     approximate elements.
     """
 
-    eps1: float = 7.0
-    eps2: float = 1e-4
-    eps3: float = 0.1
-    eps4: float = 0.01
+    eps1: ScalarLike = 7.0
+    eps2: ScalarLike = 1e-4
+    eps3: ScalarLike = 0.1
+    eps4: ScalarLike = 0.01
     corrections: int = 1
     least: int = 6
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import gammaln
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, ScalarLike
 
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
@@ -35,7 +35,9 @@ PARTS = [2 ** (-k / 4) for k in range(14)]
 are no nearer than by accident."""
 
 
-def chi_squared_limit(deviations: float, freedom: Float[Array, ""]) -> Float[Array, ""]:
+def chi_squared_limit(
+    deviations: ScalarLike, freedom: Float[Array, ""]
+) -> Float[Array, ""]:
     """The value that chi-squared exceeds as seldom as a normal number exceeds so many
     standard deviations, to a few per cent (Wilson and Hilferty 1931)."""
     part = 2 / (9 * jnp.maximum(freedom, 1.0))

@@ -4,6 +4,7 @@ Zisserman 1987, Yang 2020)."""
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import ScalarLike
 
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearise
@@ -26,9 +27,9 @@ class GraduatedNonConvexity(AbstractSearch):
     them may be wrong; with sixteen points sometimes a fifth is too many.
     """
 
-    sigma: float | None = None
-    limit: float = 3.29
-    widest: float = 300.0
+    sigma: ScalarLike | None = None
+    limit: ScalarLike = 3.29
+    widest: ScalarLike = 300.0
     absolute: int = 3
     graded: int = 12
     rounds: int = 4

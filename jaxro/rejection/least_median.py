@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, ScalarLike
 
 from ..geometry.elements import RelativePose, vertical
 from ..geometry.pairs import Pair, mask_unusable
@@ -42,7 +42,7 @@ class LeastMedian(AbstractSearch):
 
     hypotheses: AbstractHypotheses = Newton()
     count: int = 150
-    limit: float = 2.5
+    limit: ScalarLike = 2.5
     rounds: int = 2
     seed: int = 0
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, ScalarLike
 
 from ..adjustment import critical_values
 from ..adjustment.normal_equations import accumulate, cholesky, substitute
@@ -161,7 +161,7 @@ class LeaveOneOutGrubbs(AbstractProcedure):
     testable, and never rejected.
     """
 
-    level: float = 0.05
+    level: ScalarLike = 0.05
     exact: bool = True
     least: int = 6
     critical: Float[Array, "count"] | None = None

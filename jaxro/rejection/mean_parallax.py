@@ -1,6 +1,7 @@
 """The first algorithm of 1971: residual parallaxes against their mean."""
 
 import jax.numpy as jnp
+from jaxtyping import ScalarLike
 
 from ..geometry.pairs import Pair
 from .base import AbstractProcedure, Rejection
@@ -16,7 +17,7 @@ class MeanParallax(AbstractProcedure):
     largest |q| go first.
     """
 
-    eps: float = 0.01
+    eps: ScalarLike = 0.01
     more_than: int = 9
     least: int = 6
 

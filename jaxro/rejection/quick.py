@@ -1,7 +1,7 @@
 """The quick stages of `recommended`, for the ordinary pair near the vertical."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, ScalarLike
 
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearise
@@ -56,9 +56,9 @@ class Quick(AbstractStage):
     """
 
     graduated: GraduatedNonConvexity = GraduatedNonConvexity()
-    share: float = 0.6
+    share: ScalarLike = 0.6
     many: int = 60
-    accidents: float = 1e-4
+    accidents: ScalarLike = 1e-4
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         pose, use = settle(pair, self.graduated.search(pair), limit)

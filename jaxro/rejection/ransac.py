@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, ScalarLike
 
 from ..geometry.elements import RelativePose, vertical
 from ..geometry.pairs import Pair, mask_unusable
@@ -56,14 +56,14 @@ class Ransac(AbstractSearch):
 
     hypotheses: AbstractHypotheses = FivePoint()
     count: int = 512
-    confidence: float = 0.9999
-    limit: float = 3.29
-    margin: float = math.sqrt(2)
+    confidence: ScalarLike = 0.9999
+    limit: ScalarLike = 3.29
+    margin: ScalarLike = math.sqrt(2)
     steps: int = 2
     rounds: int = 2
-    level: float = 0.01
+    level: ScalarLike = 0.01
     seed: int = 0
-    sigma: float | None = None
+    sigma: ScalarLike | None = None
 
     def clean(self, pair: Pair) -> Rejection:
         pair = state_sigma(mask_unusable(pair)[0], self.sigma)
@@ -117,7 +117,7 @@ class Ransac(AbstractSearch):
         return while_loop(more, search_block, start, pair.focal_left)
 
 
-def _cost(squares: Float[Array, "point"], limit: float) -> Float[Array, ""]:
+def _cost(squares: Float[Array, "point"], limit: ScalarLike) -> Float[Array, ""]:
     """Σ min((r/sigma)², limit²); infinite where it is no number."""
     value = total(jnp.minimum(squares, limit**2))
     return jnp.where(jnp.isfinite(value), value, jnp.inf)

@@ -20,7 +20,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, ScalarLike
 
 from ..assessment.undecided import undecided_points
 from ..geometry.elements import RelativePose, vertical
@@ -46,8 +46,8 @@ length."""
 class Level(eqx.Module):
     """By what points are judged: `sigma`, `level` and `known` of `Recommended`."""
 
-    sigma: float | None
-    level: float
+    sigma: ScalarLike | None
+    level: ScalarLike
     known: bool
 
     def state(self, pair: Pair) -> Pair:
@@ -119,8 +119,8 @@ class Recommended(AbstractProcedure):
     is found: sigma0 of the orientation, as a multiple of the sigma of the pair.
     """
 
-    sigma: float | None = None
-    level: float = 0.0025
+    sigma: ScalarLike | None = None
+    level: ScalarLike = 0.0025
     stages: tuple[AbstractStage, ...] = (Plain(), Quick(), Thorough())
     known: bool = True
 

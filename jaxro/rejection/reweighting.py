@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from ..adjustment.losses import AbstractWeight, Huber, Tukey
 from ..geometry.elements import RelativePose
@@ -58,10 +58,10 @@ class Reweighting(AbstractSearch):
     """
 
     function: AbstractWeight = Tukey()
-    limit: float = 3.29
+    limit: ScalarLike = 3.29
     rounds: int = 100
-    tolerance: float = 1e-7
-    sigma: float | None = None
+    tolerance: ScalarLike = 1e-7
+    sigma: ScalarLike | None = None
     start: AbstractStart = Vertical()
 
     def clean(self, pair: Pair) -> Rejection:

@@ -28,7 +28,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.cofactor_roots import CofactorRoots
@@ -147,9 +147,9 @@ class Search(eqx.Module):
 
     count: int = 1 << 17
     block: int = 64
-    confidence: float = 0.99
-    limit: float = 3.3
-    margin: float = math.sqrt(2)
+    confidence: ScalarLike = 0.99
+    limit: ScalarLike = 3.3
+    margin: ScalarLike = math.sqrt(2)
     judges: int = 96
     finalists: int = 4
     steps: int = 3
@@ -283,7 +283,7 @@ def forward(pose: RelativePose) -> Bool[Array, ""]:
     return z**2 > x**2 + y**2
 
 
-def cost_of(pair: Pair, pose: RelativePose, limit: float) -> Float[Array, ""]:
+def cost_of(pair: Pair, pose: RelativePose, limit: ScalarLike) -> Float[Array, ""]:
     """The cost of all points, the most for one that cannot be seen from there; infinite
     where it is no number."""
     visible = seen(pair, pose, limit)
@@ -293,7 +293,7 @@ def cost_of(pair: Pair, pose: RelativePose, limit: float) -> Float[Array, ""]:
 
 
 def _point_cost(
-    square: Float[Array, "*points"], limit: float
+    square: Float[Array, "*points"], limit: ScalarLike
 ) -> Float[Array, "*points"]:
     """log(1 + min((r / sigma)², limit²) / FINE²) of (r / sigma)²."""
     cut = jnp.minimum(square, limit**2)
@@ -356,7 +356,7 @@ class Comparison(NamedTuple):
 
 
 def _compare(
-    pair: Pair, sample: Sample, poses: RelativePose, judges: int, limit: float
+    pair: Pair, sample: Sample, poses: RelativePose, judges: int, limit: ScalarLike
 ) -> Comparison:
     """The cost of every orientation for points evenly taken of all, in single
     precision."""

@@ -2,13 +2,12 @@
 one. Another stage is another `AbstractStage`; here stands what stages share."""
 
 import abc
-import math
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, ScalarLike
 
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
@@ -76,8 +75,8 @@ def believe_if_it_fits(
     pose: RelativePose,
     use: Use,
     limit: Float[Array, ""],
-    share: float,
-    accidents: float,
+    share: ScalarLike,
+    accidents: ScalarLike,
 ) -> Bool[Array, ""]:
     """Whether to believe the pose of a quick search, which may have missed a better
     one: at least this `share` of the points agree, they pass the global test, and sets
@@ -97,7 +96,7 @@ def believe_if_it_fits(
     too_well = evidence.fits_too_well(s, use)
     chance = evidence.chance_by_distance(s, out, limit)
     expected = evidence.log_accidents(chance, n, k)
-    certain = expected <= math.log(accidents)
+    certain = expected <= jnp.log(accidents)
     nearly_all = k >= NEARLY_ALL * n
     enough = (k >= share * n) & (k > 5)
     return fits & ~too_well & enough & (certain | nearly_all)

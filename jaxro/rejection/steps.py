@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PyTree, ScalarLike
 
 from ..adjustment.normal_equations import accumulate, solve
 from ..geometry.elements import RelativePose, vertical
@@ -62,7 +62,7 @@ def improve(pair: Pair, pose: RelativePose, use: Use) -> RelativePose:
 
 
 def improve_within(
-    pair: Pair, pose: RelativePose, limit: float, margin: float, steps: int
+    pair: Pair, pose: RelativePose, limit: ScalarLike, margin: ScalarLike, steps: int
 ) -> RelativePose:
     """The pose after steps on the points with |r| <= margin limit sigma, the last one
     on those with |r| <= limit sigma."""

@@ -5,7 +5,7 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, ScalarLike
 
 from ..geometry.pairs import Pair
 
@@ -41,7 +41,7 @@ def choose_places(
 
 
 def move_up(
-    pair: Pair, values: Float[Array, "point ..."], fill: float = 0.0
+    pair: Pair, values: Float[Array, "point ..."], fill: ScalarLike = 0.0
 ) -> Float[Array, "point ..."]:
     """The values of the points that take part, moved before all others, so that padding
     changes no subset."""
@@ -78,8 +78,8 @@ def subsets_enough(
     agree: Float[Array, ""],
     of: Float[Array, ""],
     size: int,
-    confidence: float,
-    luck: float = 1.0,
+    confidence: ScalarLike,
+    luck: ScalarLike = 1.0,
 ) -> Float[Array, ""]:
     """How many subsets of `size` points hold one of agreeing points alone with
     probability `confidence`: k with 1 - (1 - p / luck)^k = confidence, p the share of
@@ -88,4 +88,4 @@ def subsets_enough(
         jnp.maximum(agree - k, 0.0) / jnp.maximum(of - k, 1.0) for k in range(size)
     )
     share = jnp.clip(share / luck, CERTAIN, 1 - CERTAIN)
-    return math.log1p(-confidence) / jnp.log1p(-share)
+    return jnp.log1p(jnp.negative(confidence)) / jnp.log1p(-share)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, mask_unusable
@@ -103,10 +103,10 @@ class Thorough(AbstractStage):
     near: Ransac = Ransac(hypotheses=Newton(block=64), count=1024, limit=5.0)
     few: int = 32
     search: Search = Search()
-    share: float = 0.4
-    accidents_at_once: float = 0.02
-    accidents: float = 1e-3
-    better: float = 1.5
+    share: ScalarLike = 0.4
+    accidents_at_once: ScalarLike = 0.02
+    accidents: ScalarLike = 1e-3
+    better: ScalarLike = 1.5
     least: int = 256
     known: bool = True
 
@@ -216,7 +216,7 @@ class Thorough(AbstractStage):
     def _most_accidents(self, of: Float[Array, ""]) -> Float[Array, ""]:
         """Logarithm of the expected number of accidents up to which a set of so many
         points is believed."""
-        return math.log(self.accidents) * jnp.maximum(of / PLENTY, 1.0)
+        return jnp.log(self.accidents) * jnp.maximum(of / PLENTY, 1.0)
 
     def _near_vertical(self, pair: Pair) -> RelativePose:
         """The best orientation of those that begin at the vertical."""
@@ -298,7 +298,7 @@ def _other_pose(
     return if_needed(flat & asked, find, (pose, asked & False))
 
 
-def _narrow(pair: Pair, pose: RelativePose, limit: float) -> RelativePose:
+def _narrow(pair: Pair, pose: RelativePose, limit: ScalarLike) -> RelativePose:
     """The pose that the points near it lead to, as the limit within which they count
     narrows (weights of Geman and McClure): where sigma is too large, wrong points
     within the limit hide the right pose from a search."""

@@ -1,6 +1,7 @@
 """The second algorithm of 1971: residual parallaxes against 3 m_q."""
 
 import jax.numpy as jnp
+from jaxtyping import ScalarLike
 
 from ..geometry.pairs import Pair
 from .base import AbstractProcedure, Rejection
@@ -19,7 +20,7 @@ class ThreeSigma(AbstractProcedure):
     largest |q| go first.
     """
 
-    factor: float = 3.0
+    factor: ScalarLike = 3.0
     more_than: int = 9
     least: int = 6
 

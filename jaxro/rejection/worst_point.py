@@ -1,6 +1,7 @@
 """The third algorithm of 1971: reject the largest residual parallax, and begin again."""
 
 import jax.numpy as jnp
+from jaxtyping import ScalarLike
 
 from ..geometry.pairs import Pair, mask_unusable
 from ..xla.passes import count
@@ -26,7 +27,7 @@ class WorstPoint(AbstractProcedure):
     (Dorozhinsky 1971, eqs 1 and 3).
     """
 
-    eps: float = 0.01
+    eps: ScalarLike = 0.01
     more_than: int = 9
     least: int = 6
 
@@ -44,7 +45,7 @@ class WorstPoint(AbstractProcedure):
             go_on = (count(wrong) > 0) & (count(mask) > self.least) & enough
             return Round(
                 statistic=q,
-                limit=self.eps + mean,
+                limit=mean + self.eps,
                 rejected=largest(q, mask) & go_on,
                 parallax=solved.parallax,
                 elements=element_values(solved.elements),

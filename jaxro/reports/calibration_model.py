@@ -21,8 +21,7 @@ from ..calibration.results import RESULTS
 from ..calibration.zones import AbstractZones
 from ..plots import CorrectionMap
 from ..tables.images import NamedImages
-from ..xla.programs import Program
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .calibration_tests import Compared, TestedZones
 
 RESULT_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
@@ -68,10 +67,11 @@ class Figures(NamedTuple):
 
 def read(found: Calibration) -> Figures:
     """The figures of a calibration, as NumPy values."""
-    found_by_name = Program(_read, {}, COMPILE_FAST)(found)
+    found_by_name = _read(found)
     return Figures(**jax.tree.map(np.asarray, found_by_name))
 
 
+@compiled
 def _read(found: Calibration) -> dict[str, Array]:
     """The fields of `Figures`."""
     measured, adjustment = found.measured, found.adjustment
@@ -306,12 +306,7 @@ def distortion(found: Calibration, places: np.ndarray) -> np.ndarray:
     """`distortion_deviations` as NumPy values, by a program for 16, 32, ... places."""
     room = 1 << max(4, (len(places) - 1).bit_length())
     longer = np.pad(places, ((0, room - len(places)), (0, 0)), mode="edge")
-    program = Program(_distortion, {}, COMPILE_FAST)
-    return np.asarray(program((found, jnp.asarray(longer))))[: len(places)]
-
-
-def _distortion(data: tuple[Calibration, Array]) -> Array:
-    return distortion_deviations(*data)
+    return np.asarray(compiled(distortion_deviations)(found, longer))[: len(places)]
 
 
 # -------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Camera, Coordinates, Pair, mask_unusable
 from ..tables.measured import CameraPairs, Table, take, to_list
-from ..xla.programs import Program
+from ..xla.programs import compiled
 from ..xla.settings import MOMENT, settings_for
 from .columns import (
     RESULT_ADVICE,
@@ -236,8 +236,7 @@ def find_patterns(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, Pattern]
     thinned = choose(pairs, chosen, rows)
     lengths = thinned.lengths
     batch = thinned.pad_to(np.arange(len(chosen)), sizes(lengths, 1)[0])
-    settings = settings_for(batch.x_left.size, MOMENT)
-    read = Program(_linearise, {}, settings)((batch, of_pairs["pose"][chosen]))
+    read = _linearise(batch, of_pairs["pose"][chosen])
     conditions = jax.tree.map(np.asarray, read)
     return {
         int(number): neighbours.of_linear(
@@ -247,8 +246,9 @@ def find_patterns(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, Pattern]
     }
 
 
+@compiled(settings=lambda pairs, _: settings_for(pairs.x_left.size, MOMENT))
 def _linearise(
-    pairs_and_poses: tuple[Pair, Float[Array, "pair 7"]],
+    pairs: Pair, poses: Float[Array, "pair 7"]
 ) -> tuple[Linear, Coordinates]:
     """The linearised conditions of pairs at their poses, and the coordinates."""
 
@@ -256,4 +256,4 @@ def _linearise(
         used = mask_unusable(pair)[0]
         return linearise(used, RelativePose(*pose)), used.coordinates
 
-    return jax.vmap(one)(*pairs_and_poses)
+    return jax.vmap(one)(pairs, poses)

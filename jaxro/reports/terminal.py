@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.segment import Segment
 
 from ..tables.fields import tell
-from ..xla import store
+from ..xla import notices
 
 PLAIN = str.maketrans(
     {
@@ -161,42 +161,12 @@ class Spent(NamedTuple):
         return f"{self.work:.1f} s, and {self.compiling:.1f} s for compiling"
 
 
-class _Compiling:
-    """The seconds in which something was compiled, be it one program or several."""
-
-    def __init__(self) -> None:
-        self._lock, self._programs = threading.Lock(), 0
-        self._since = self._before = 0.0
-
-    @contextmanager
-    def one(self) -> Iterator[None]:
-        """Around one compilation."""
-        with self._lock:
-            self._before, self._since = self.seconds, time.perf_counter()
-            self._programs += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._before, self._since = self.seconds, time.perf_counter()
-                self._programs -= 1
-
-    @property
-    def seconds(self) -> float:
-        """Up to now."""
-        now = time.perf_counter() if self._programs else self._since
-        return self._before + now - self._since
-
-
-_compiling = _Compiling()
-
-
 def stopwatch() -> Callable[[], Spent]:
     """What was spent since this call."""
-    began, before = time.perf_counter(), _compiling.seconds
+    began, before = time.perf_counter(), notices.seconds()
 
     def spent() -> Spent:
-        compiling = _compiling.seconds - before
+        compiling = notices.seconds() - before
         return Spent(time.perf_counter() - began - compiling, compiling)
 
     return spent
@@ -209,15 +179,10 @@ LEAST_TOLD = 0.05
 """Seconds of compiling that are told of."""
 
 
-@contextmanager
-def say_compiling(shape: tuple[int, ...]) -> Iterator[None]:
-    """Around a compilation for pairs of this shape, whose time is measured: a line on
-    the terminal if it takes long."""
-    *pairs, points = shape or (0,)
-    of = f"{pairs[0]} pairs of up to " if pairs and pairs[0] > 1 else ""
-    once = ", once on this machine" if store.active() else ""
-    with _compiling.one(), say_what(f"Compiling for {of}{points} points{once} ..."):
-        yield
+def say_compiling(line: str) -> None:
+    """Tell of a compilation that takes long, if somebody looks."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        print(tell(f"{line.capitalize()} ..."), file=sys.stderr, flush=True)
 
 
 @contextmanager

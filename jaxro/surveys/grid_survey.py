@@ -30,8 +30,7 @@ from ..adjustment import critical_values as critical
 from ..adjustment.guarded import ratio, root
 from ..adjustment.propagation import jacobian, propagate_each
 from ..xla.passes import total
-from ..xla.programs import Program, is_traced
-from ..xla.settings import COMPILE_FAST
+from ..xla.programs import compiled
 from .heights import Number, Sight, Square, Station, sighted_height
 from .levelling import Levelled, adjust_heights
 from .networks import Flags, Network, Places, network
@@ -221,13 +220,14 @@ def heights(
 def solve(survey: Survey, *, level: float = 0.001, power: float = 0.80) -> Surveyed:
     """Heights with their standard deviations, and the tests of the traverses. Works
     under jit and vmap."""
-    options = {"level": level, "power": power}
-    if is_traced(survey):
-        return _solve(survey, **options)
-    return Program(_solve, options, COMPILE_FAST)(survey)
+    return _solve(survey, critical.delta_normal(level, power), critical.normal(level))
 
 
-def _solve(survey: Survey, level: float, power: float) -> Surveyed:
+@compiled
+def _solve(
+    survey: Survey, smallest: Float[Array, ""], limit: Float[Array, ""]
+) -> Surveyed:
+    """`smallest`: the error that is found, in standard deviations; `limit`: of |w|."""
     variances = leg_variances(survey)
     value, adjusted = heights(survey, survey.measured, variances)
     deviations, shares = _propagate(survey, variances)
@@ -236,7 +236,7 @@ def _solve(survey: Survey, level: float, power: float) -> Surveyed:
         there, spread = adjusted.testable, deviations.misclosure
         w = ratio(value.misclosure, spread, there)
         r = jnp.where(there, adjusted.redundancy, 1.0)
-        error = critical.delta_normal(level, power) * spread / r
+        error = smallest * spread / r
         detectable = jnp.where(there, error, jnp.inf)
         leg_deviations = jnp.sqrt(variances)
     return Surveyed(
@@ -245,7 +245,7 @@ def _solve(survey: Survey, level: float, power: float) -> Surveyed:
         shares=shares,
         w=w,
         detectable=detectable,
-        limit=jnp.asarray(critical.normal(level)),
+        limit=limit,
         leg_deviations=leg_deviations,
         adjusted=adjusted,
     )

@@ -16,10 +16,10 @@ rows are those of benchmarks/decisions.md that measure the part.
 | `settings.RUN_FAST` | no settings | sums in vectors | fast math |
 | `settings.COMPILE_FAST` | no settings | sooner first calls | quick compile |
 | `settings.WIDE_VECTORS` | no settings | more numbers at once | other settings |
-| `programs.Program` | `jax.jit` | one program for equal options | (a cache) |
+| `programs.compiled` | `jax.jit` | one program for all numbers | (a cache) |
 | `programs.jit_in_this_thread` | `jax.jit` | shorter calls of one pair | same thread |
 | `slabs.spread` | a loop over parts | all cores, bounded memory | threads |
-| `store` | `jax.jit` | later processes compile nothing | command line |
+| `store` | `jax.jit` | later processes compile nothing | kept on disk |
 """
 
 from .settings import Trick as Trick, plain as plain

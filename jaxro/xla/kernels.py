@@ -23,18 +23,18 @@ _fusing_points = jax.make_user_context(False)
 
 @lru_cache(maxsize=64)
 def one_kernel(function: Callable) -> Callable:
-    """The function of (data, **options) as one compiled function of the processor.
+    """The function of (*data, **options) as one compiled function of the processor.
 
     XLA's CPU backend compiles a program as many small ones and goes from one to the
     next at run time, which costs more than the work of a small pair.
     """
 
     @wraps(function)
-    def within(data: PyTree, **options: Any) -> PyTree:
-        with_options = lambda data: function(data, **options)
+    def within(*data: PyTree, **options: Any) -> PyTree:
+        with_options = lambda *data: function(*data, **options)
         if is_plain(Trick.ONE_KERNEL):
-            return with_options(data)
-        return _call(with_options, **_AS_ONE)(data)
+            return with_options(*data)
+        return _call(with_options, **_AS_ONE)(*data)
 
     return kernels_of_parts(within)
 
@@ -45,9 +45,9 @@ def one_kernel_fusing_points(function: Callable) -> Callable:
     one loop."""
 
     @wraps(function)
-    def within(data: PyTree, **options: Any) -> PyTree:
+    def within(*data: PyTree, **options: Any) -> PyTree:
         with _fusing_points(True):
-            return one_kernel(function)(data, **options)
+            return one_kernel(function)(*data, **options)
 
     return within
 
@@ -58,9 +58,9 @@ def kernels_of_parts(function: Callable) -> Callable:
     processor; compiles sooner than `one_kernel`."""
 
     @wraps(function)
-    def within(data: PyTree, **options: Any) -> PyTree:
+    def within(*data: PyTree, **options: Any) -> PyTree:
         with _making_kernels(True):
-            return function(data, **options)
+            return function(*data, **options)
 
     return within
 

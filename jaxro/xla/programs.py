@@ -1,28 +1,36 @@
-"""Compiled programs of functions that have static options.
+"""Compiled programs of functions: numbers are arguments, structure is the program.
 
-A program is cached by its function and its static options (classes, modules, plain
-values), so that a second call with the same options compiles nothing. What is switched
-off by `settings.plain` is part of every key.
+    @compiled
+    def fit(measured, *, model): ...
+
+`fit(...)` is one program for each structure of its arguments: arrays are arguments of
+it, and so are the numbers in `measured` and real numbers in `model` (tolerances, levels,
+strengths); classes, whole numbers and names choose the program. Functions among the
+arguments are compared by their code (`closures`). A second call with other numbers
+compiles nothing, nor does the next process where programs are kept (`store`). What is
+switched off by `settings.plain` is part of every key.
 """
 
 import gc
 import os
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import lru_cache, wraps
-from typing import Any
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property, lru_cache, update_wrapper, wraps
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import PyTree
 
-from . import store
+from . import notices, store
+from .closures import FUNCTIONS, Unknown, keep_constants, open_function
 from .settings import (
+    COMPILE_FAST,
     NO_LIBRARY_SUMS,
-    RUN_FAST,
     Trick,
     is_plain,
     known_settings,
@@ -30,17 +38,8 @@ from .settings import (
     switched_off,
 )
 
-Watch = Callable[[tuple[int, ...]], AbstractContextManager]
-"""Of the shape of the first array of the data: what surrounds a compilation."""
-
-_watch: Watch | None = None
-
-
-def watch(surround: Watch) -> None:
-    """Let `surround` be around every compilation from now on, to say what is awaited."""
-    global _watch
-    _watch = surround
-
+MOST = 64
+"""Programs that a process keeps; what was not used for longest goes."""
 
 _used = _forked = False
 
@@ -55,107 +54,302 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_mark_child)
 
 
-class _Key:
-    """Static options, compared by value."""
-
-    def __init__(self, tree: PyTree):
-        self.tree = tree
-        leaves, structure = jax.tree.flatten(tree)
-        self.key = (tuple(leaves), structure)
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other) -> bool:
-        return self.key == other.key
+Settings = dict[str, Any] | Callable[..., dict[str, Any]]
+"""Settings of the compiler, or what makes them of the arguments."""
 
 
-class Program:
-    """data -> function(data, **options), compiled; arrays among the options are passed
-    along as arguments. Works under jit, vmap and grad, compiled or not.
+def compiled(
+    function: Callable | None = None,
+    *,
+    settings: Settings = COMPILE_FAST,
+    kernel: Callable[[Callable], Callable] | None = None,
+    static: tuple[str, ...] = (),
+    unit: str | None = None,
+) -> Any:
+    """The function as a compiled program: a decorator.
 
-    `kernel`: `kernels.one_kernel` or the like, which the compiler may refuse; the
-    program is then compiled without.
+    All numbers in positional arguments are arguments of the program, and so are arrays
+    and real numbers in keyword arguments, but for those that are `static`. Works under
+    jit, vmap and grad, compiled or not. `kernel`: `kernels.one_kernel` or the like,
+    which the compiler may refuse; the program is then compiled without. `unit`: what the
+    first array has along its last axis, which a waiting user is told.
     """
+    if function is None:
+        return lambda function: compiled(
+            function, settings=settings, kernel=kernel, static=static, unit=unit
+        )
+    return Compiled(function, settings, kernel, static, unit)
+
+
+class Compiled:
+    """A function that runs as a program; see `compiled`."""
 
     def __init__(
         self,
         function: Callable,
-        options: dict[str, Any],
-        settings: dict[str, Any] = RUN_FAST,
-        *,
+        settings: Settings = COMPILE_FAST,
         kernel: Callable[[Callable], Callable] | None = None,
+        static: tuple[str, ...] = (),
+        unit: str | None = None,
     ):
-        self._settings = tuple(settings.items())
-        self._arrays, static = eqx.partition(options, eqx.is_array)
-        self._static = _Key(static)
-        self._function = function
-        self._kernel = kernel
+        update_wrapper(self, function)
+        self.function, self._settings = function, settings
+        self._kernel, self._static, self._unit = kernel, static, unit
+
+    def __call__(self, *data: PyTree, **options: Any) -> Any:
+        return self.bind(**options)(*data)
+
+    def using(
+        self,
+        settings: Settings,
+        kernel: Callable[[Callable], Callable] | None = None,
+    ) -> "Compiled":
+        """The same function, compiled with other settings."""
+        return Compiled(self.function, settings, kernel, self._static, self._unit)
+
+    def bind(self, **options: Any) -> "Program":
+        """The program with its keyword arguments given."""
+        static = {name: options.pop(name) for name in self._static if name in options}
+        source = Source(self.function, self._settings, self._kernel, self._unit)
+        return Program(source, options, static)
+
+
+class Source(NamedTuple):
+    """What a program is made of, and how."""
+
+    function: Callable
+    settings: Settings
+    kernel: Callable[[Callable], Callable] | None
+    unit: str | None
+
+
+class _Structure:
+    """All of the arguments but their numbers, compared by value: the structure of data,
+    of options and of what is held, each with its leaves."""
+
+    def __init__(self, *trees: tuple):
+        self.trees = trees
+        self._hash = hash(trees)
+
+    def restore(self, numbers: Sequence[Any]) -> list[Any]:
+        """Data, options and what is held, with these numbers in their places."""
+        rest = iter(numbers)
+        return [
+            structure.unflatten(
+                next(rest) if leaf is _NUMBER else leaf.value for leaf in leaves
+            )
+            for structure, leaves in self.trees
+        ]
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Structure) and self.trees == other.trees
+
+    def __reduce__(self):
+        return _Structure, tuple(
+            structure.unflatten(leaves) for structure, leaves in self.trees
+        )
+
+
+def _divide(
+    data: tuple, options: dict[str, Any], held: dict[str, Any]
+) -> tuple[list[Any], _Structure]:
+    """The numbers of the arguments, and all else of them. Raises `Unknown`."""
+    numbers: list[Any] = []
+    trees = (
+        _take_numbers(data, _is_number, numbers),
+        _take_numbers(options, _is_real, numbers),
+        _take_numbers(held, lambda leaf: False, numbers),
+    )
+    return numbers, _Structure(*trees)
+
+
+def _take_numbers(
+    tree: PyTree, is_argument: Callable[[Any], bool], numbers: list[Any]
+) -> tuple:
+    """The structure of a tree and its leaves, with _NUMBER in the place of each
+    argument, which is added to `numbers`."""
+    leaves, structure = jax.tree.flatten(tree)
+    if any(isinstance(leaf, FUNCTIONS) for leaf in leaves):
+        opened = [open_function(leaf) for leaf in leaves]
+        leaves, structure = jax.tree.flatten(structure.unflatten(opened))
+    kept = []
+    for leaf in leaves:
+        if is_argument(leaf):
+            numbers.append(leaf)
+            kept.append(_NUMBER)
+        else:
+            kept.append(_Leaf(leaf, type(leaf)))
+    return structure, tuple(kept)
+
+
+class _Leaf(NamedTuple):
+    """A leaf that is no argument; 1, 1.0 and True are three."""
+
+    value: Any
+    kind: type
+
+
+class _Number:
+    """Stands where a number is an argument of the program."""
+
+
+_NUMBER = _Number()
+_ARRAYS = (jax.Array, np.ndarray, np.generic)
+
+
+def _is_number(leaf: Any) -> bool:
+    """Whether a leaf of what is computed with is an argument of the program."""
+    return isinstance(leaf, (*_ARRAYS, bool, int, float, complex))
+
+
+def _is_real(leaf: Any) -> bool:
+    """Whether a leaf of the options is one."""
+    return isinstance(leaf, (*_ARRAYS, float))
+
+
+class Program:
+    """data -> function(*data, **options), compiled."""
+
+    def __init__(self, source: Source, options: dict[str, Any], held: dict[str, Any]):
+        self._source, self._options, self._held = source, options, held
         self._plain = switched_off()
 
-    def __call__(self, data: PyTree) -> PyTree:
+    def __call__(self, *data: PyTree) -> Any:
         _refuse_fork()
-        if is_traced((data, self._arrays)):
-            # compiled as a part of the caller's program, or, under a `grad` or `vmap`
-            # that nobody compiles, by itself and once
-            return _as_part(self._function, self._static)(data, self._arrays)
         if self._plain == switched_off():
             return self._call(data)
         with plain(self._plain):  # a thread that helps does not know of it
             return self._call(data)
 
-    def _call(self, data: PyTree) -> PyTree:
-        settings = *self._settings, *NO_LIBRARY_SUMS.items()
+    def _call(self, data: tuple) -> Any:
+        options = self._options | self._held
+        try:
+            numbers, structure = _divide(data, self._options, self._held)
+        except Unknown:
+            # nothing tells whether it is what it was: compiled for this call alone
+            return jax.jit(lambda: self._source.function(*data, **options))()
+        try:
+            return self._choose(data, numbers, structure)
+        except _NO_ARGUMENT:
+            if not keep_constants(structure.restore(numbers)):
+                raise
+        return self._choose(data, *_divide(data, self._options, self._held))
+
+    def _choose(self, data: tuple, numbers: list, structure: _Structure) -> Any:
+        """The result by the program that fits."""
+        source = self._source
+        if is_traced(numbers):
+            # compiled as a part of the caller's program, or, under a `grad` or `vmap`
+            # that nobody compiles, by itself and once
+            return _as_part(source.function, structure)(*numbers)
+        settings = source.settings
+        if callable(settings):
+            settings = settings(*data, **self._options, **self._held)
+        every = tuple(settings.items())
+        whole = *every, *NO_LIBRARY_SUMS.items()
+        remembered = _remembered(source.function, structure, every, self._plain)
         if (
-            self._kernel is not None
-            and not self.refused
-            and known_settings(dict(settings))
+            source.kernel is not None
+            and "refused" not in remembered
+            and known_settings(dict(whole))
         ):
             try:
-                return self._run(data, self._kernel(self._function), settings)
+                return self._run(
+                    source.kernel(source.function), numbers, structure, whole
+                )
             except jax.errors.JaxRuntimeError as error:
                 if "RESOURCE_EXHAUSTED" in str(error):
                     raise
                 # sorting, say, in what a caller selects
-                self._remembered["refused"] = True
-        return self._run(data, self._function, self._settings)
+                remembered["refused"] = True
+        return self._run(source.function, numbers, structure, every)
 
-    @property
-    def refused(self) -> bool:
-        """Whether the compiler could not make one kernel of it."""
-        return "refused" in self._remembered
-
-    @property
-    def _remembered(self) -> dict[str, Any]:
-        return _remembered(self._function, self._static, self._settings, self._plain)
-
-    def _run(self, data: PyTree, function: Callable, settings: tuple) -> PyTree:
-        key = self._function, self._static, settings, self._plain
-        arguments = data, self._arrays
-        if _watch is None and not store.active():
-            return _compile(function, *key[1:])(*arguments)
-        shapes = tuple((np.shape(a), str(a.dtype)) for a in jax.tree.leaves(arguments))
-        where = "stored" if store.active() else "compiled"
-        known = _remembered(*key).setdefault(where, {})
-        if shapes in known:
-            return known[shapes](*arguments)
-        found = None
-        with _watch(shapes[0][0] if shapes else ()) if _watch else nullcontext():
+    def _run(
+        self, function: Callable, numbers: list, structure: _Structure, settings: tuple
+    ) -> Any:
+        key = function, structure, settings, self._plain
+        place = *key, tuple(map(_shape, numbers)), store.active()
+        program = _programs.find(place)
+        if program is not None:
+            return program(*numbers)
+        flat, options = _flat(function, structure), known_settings(dict(settings))
+        with notices.compiling(self._describe(numbers)):
             if store.active():
-                flat = _flat(function, self._static)
-                options = known_settings(dict(settings))
-                program = store.load_or_compile(flat, options, arguments, key)
+                program = store.load_or_compile(flat, options, numbers, key)
             else:
-                program = _compile(function, *key[1:])
-                found = program(*arguments)  # the first call compiles
-        known[shapes] = program
-        return program(*arguments) if found is None else found
+                program = jit_in_this_thread(flat, options)
+            found = program(*numbers)  # the first call of a jit compiles
+        _programs.keep(place, program)
+        return found
 
-    @property
+    def _describe(self, numbers: list[Any]) -> str:
+        """What is compiled, for a user who waits."""
+        unit, kept = self._source.unit, ", kept for later" if store.active() else ""
+        if unit is None or not numbers or not np.shape(numbers[0]):
+            return f"a program{kept}"
+        return f"for up to {np.shape(numbers[0])[-1]} {unit}{kept}"
+
+    @cached_property
     def outputs(self) -> dict[Any, PyTree]:
-        """Room for a caller to keep the shapes of its results, as long as the compiled
-        program lives."""
-        return self._remembered.setdefault("outputs", {})
+        """Room for a caller to keep the shapes of its results."""
+        try:
+            _, structure = _divide((), self._options, self._held)
+        except Unknown:
+            return {}
+        remembered = _remembered(self._source.function, structure, (), self._plain)
+        return remembered.setdefault("outputs", {})
+
+
+_NO_ARGUMENT = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+"""What JAX says where a value is needed and an argument is found."""
+
+
+def _shape(leaf: Any) -> tuple:
+    """What a program depends on of an argument."""
+    dtype = getattr(leaf, "dtype", None)
+    return (type(leaf),) if dtype is None else (leaf.shape, dtype)
+
+
+class _Recent:
+    """The programs that were used last."""
+
+    def __init__(self, most: int):
+        self._most, self._lock = most, threading.Lock()
+        self._kept: OrderedDict[tuple, Callable] = OrderedDict()
+
+    def find(self, place: tuple) -> Callable | None:
+        with self._lock:
+            program = self._kept.get(place)
+            if program is not None:
+                self._kept.move_to_end(place)
+            return program
+
+    def keep(self, place: tuple, program: Callable) -> None:
+        with self._lock:
+            self._kept[place] = program
+            while len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+
+    def clear(self) -> None:
+        with self._lock:
+            self._kept.clear()
+
+
+_programs = _Recent(MOST)
+
+
+def forget() -> None:
+    """Give back all compiled programs."""
+    _programs.clear()
+    _as_part.cache_clear()
+    _remembered.cache_clear()
 
 
 def jit_in_this_thread(
@@ -191,11 +385,14 @@ def jit_in_this_thread(
     return lambda *arguments: compiled(*arguments)[0]
 
 
-def _flat(function: Callable, static: _Key) -> Callable:
+def _flat(function: Callable, structure: _Structure) -> Callable:
+    """The function of the numbers alone."""
+
     @wraps(function)
-    def flat(data: PyTree, arrays: dict[str, Any]) -> PyTree:
+    def flat(*numbers: Any) -> PyTree:
         with pause_collection():
-            return function(data, **eqx.combine(arrays, static.tree))
+            data, options, held = structure.restore(numbers)
+            return function(*data, **options, **held)
 
     return flat
 
@@ -227,18 +424,13 @@ def _refuse_fork() -> None:
 
 
 @lru_cache(maxsize=64)
-def _as_part(function: Callable, static: _Key) -> Callable:
-    return jax.jit(_flat(function, static))
+def _as_part(function: Callable, structure: _Structure) -> Callable:
+    return jax.jit(_flat(function, structure))
 
 
-@lru_cache(maxsize=64)
-def _compile(function: Callable, static: _Key, settings: tuple, off: Trick) -> Callable:
-    return jit_in_this_thread(_flat(function, static), known_settings(dict(settings)))
-
-
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=2 * MOST)
 def _remembered(
-    function: Callable, static: _Key, settings: tuple, off: Trick
+    function: Callable, structure: _Structure, settings: tuple, off: Trick
 ) -> dict[str, Any]:
     """What is remembered of a program."""
     return {}

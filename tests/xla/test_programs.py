@@ -1,10 +1,13 @@
-"""Programs that run in the thread that calls them, as users have them: not kept on
-disk, as those of the other tests are."""
+"""Compiled programs: what is an argument of them and what is not; and that they run in
+the thread that calls them, as users have them: not kept on disk, as those of the other
+tests are."""
 
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,18 +16,116 @@ import pytest
 import jaxro
 from jaxro.geometry import mock_pairs
 from jaxro.xla import programs
-from jaxro.xla.programs import Program, jit_in_this_thread
+from jaxro.xla.programs import compiled, jit_in_this_thread
 from jaxro.xla.settings import RUN_FAST
+
+
+class Loss(eqx.Module):
+    """Options as procedures and losses have them."""
+
+    scale: float = 2.0
+    rounds: int = 3
+
+
+SHIFT = np.array([1.0, 2.0])
+FACTOR = 2.0
+
+
+def scaled(x, *, loss, also=None):
+    traced.append(True)
+    for _ in range(loss.rounds):
+        x = x * loss.scale
+    return x if also is None else also(x)
+
+
+traced = []
+run = compiled(scaled)
+
+
+def retraced(call):
+    """The result of a call, and whether it made another program."""
+    traced.clear()
+    return call(), bool(traced)
+
+
+def test_real_numbers_are_arguments_and_whole_numbers_choose_the_program():
+    x = np.arange(2.0)
+    run(x, loss=Loss())
+    found, again = retraced(lambda: run(x, loss=Loss(scale=3.0)))
+    assert not again
+    np.testing.assert_allclose(found, 27 * x)
+    found, again = retraced(lambda: run(x, loss=Loss(rounds=2)))
+    assert again
+    np.testing.assert_allclose(found, 4 * x)
+
+
+def functions_of(shift):
+    """The same function written in several ways, as a caller may write it anew for each
+    call."""
+    return {
+        "closure": lambda x: x + shift,
+        "default": lambda x, shift=shift: x + shift,
+        "partial": partial(lambda shift, x: x + shift, shift),
+        "within": lambda x: (lambda y: y + shift)(x),
+        "method": Adder(shift).add,
+    }
+
+
+class Adder(eqx.Module):
+    shift: jax.Array
+
+    def add(self, x):
+        return x + self.shift
+
+
+@pytest.mark.parametrize("way", ["closure", "default", "partial", "within", "method"])
+def test_functions_are_compared_by_their_code(way):
+    """Arrays that they close over are arguments, with derivatives."""
+    x = np.zeros(2)
+    of = lambda shift: run(x, loss=Loss(), also=functions_of(shift)[way])
+    np.testing.assert_array_equal(of(jnp.ones(2)), [1.0, 1.0])
+    found, again = retraced(lambda: of(jnp.array([2.0, 3.0])))
+    assert not again
+    np.testing.assert_array_equal(found, [2.0, 3.0])
+    by = jax.grad(lambda shift: jnp.sum(of(shift)))(jnp.ones(2))
+    np.testing.assert_array_equal(by, [1.0, 1.0])
+
+
+def test_what_a_function_refers_to_is_never_the_one_of_an_earlier_call(monkeypatch):
+    x, here = np.ones(2), sys.modules[__name__]
+    of_globals = lambda x: x * FACTOR + SHIFT
+    state = type("State", (), {"factor": 2.0})()
+    of_state = lambda x: x * state.factor
+    in_numpy = lambda table: lambda x: x + np.sin(table)[0] + table.shape[0]
+    of = lambda also: run(x, loss=Loss(rounds=0), also=also)
+    np.testing.assert_allclose(of(of_globals), [3.0, 4.0])
+    np.testing.assert_allclose(of(of_state), [2.0, 2.0])
+    np.testing.assert_allclose(of(in_numpy(np.zeros(1))), [2.0, 2.0])
+    monkeypatch.setattr(here, "SHIFT", np.array([5.0, 6.0]))
+    monkeypatch.setattr(here, "FACTOR", 1.0)
+    state.factor = 3.0
+    np.testing.assert_allclose(of(of_globals), [6.0, 7.0])
+    np.testing.assert_allclose(of(of_state), [3.0, 3.0])
+    np.testing.assert_allclose(of(in_numpy(np.array([np.pi / 2]))), [3.0, 3.0])
+    np.testing.assert_allclose(of(lambda x: -x), [-1.0, -1.0])
+
+
+def test_old_programs_are_given_back(monkeypatch):
+    monkeypatch.setattr(programs._programs, "_most", 3)
+    twice = compiled(lambda x: 2 * x)
+    for size in range(8):
+        twice(np.zeros(size))
+    assert len(programs._programs._kept) <= 3
 
 
 @pytest.fixture
 def unkept():
     folder = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
-    programs._compile.cache_clear()
+    programs.forget()
     yield
     jax.config.update("jax_compilation_cache_dir", folder)
-    programs._compile.cache_clear()
+    programs.forget()
 
 
 def long(x):
@@ -35,7 +136,7 @@ def long(x):
 
 def test_a_program_has_run_when_its_call_returns(unkept):
     x = jnp.linspace(0.0, 1.0, 3000)
-    for run in (jit_in_this_thread(long), lambda x: Program(long, {}, RUN_FAST)(x)):
+    for run in (jit_in_this_thread(long), compiled(long, settings=RUN_FAST)):
         jax.block_until_ready(run(x))
         assert run(x).is_ready()
 

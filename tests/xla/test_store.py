@@ -3,15 +3,20 @@ them."""
 
 import os
 import pickle
+import subprocess
+import sys
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxro.xla import programs, store
-from jaxro.xla.programs import Program
+from jaxro.xla.programs import compiled
 
 
+@compiled
 def double(x):
     return 2 * x
 
@@ -24,14 +29,13 @@ def folder(tmp_path):
     run()
     yield kept
     store.use(None)
-    programs._remembered.cache_clear()
+    programs.forget()
 
 
 def run() -> None:
     """Calls the program as a new process would."""
-    programs._remembered.cache_clear()
-    result = Program(double, {})(jnp.arange(3.0))
-    np.testing.assert_array_equal(result, [0.0, 2.0, 4.0])
+    programs.forget()
+    np.testing.assert_array_equal(double(jnp.arange(3.0)), [0.0, 2.0, 4.0])
 
 
 class Trap:
@@ -61,19 +65,93 @@ def test_a_pickle_without_its_digest_is_not_read(folder, tmp_path):
     assert not (tmp_path / "sprung").exists()
 
 
-@pytest.mark.parametrize("kind", ["link", "writable"])
+@pytest.mark.parametrize("kind", ["link", "writable", "pipe"])
 def test_a_file_of_others_is_not_read(folder, tmp_path, kind):
     path, trap = program_in(folder), pickle.dumps(Trap(tmp_path / "sprung"))
-    digest = store.hashlib.sha256(trap).digest()
-    if kind == "link":
-        path.unlink()
-        (tmp_path / "planted").write_bytes(digest + trap)
-        path.symlink_to(tmp_path / "planted")
-    else:
-        path.write_bytes(digest + trap)
+    sealed = store._seal(bytes.fromhex(path.stem), trap) + trap
+    if kind == "writable":
+        path.write_bytes(sealed)
         path.chmod(0o666)
+    else:
+        path.unlink()
+    if kind == "link":
+        (tmp_path / "planted").write_bytes(sealed)
+        path.symlink_to(tmp_path / "planted")
+    if kind == "pipe":
+        os.mkfifo(path)
     run()
     assert not (tmp_path / "sprung").exists()
+
+
+def test_a_file_under_the_name_of_another_program_is_not_read(folder):
+    """Two programs change places: each is compiled anew."""
+    path = program_in(folder)
+    content = path.read_bytes()
+    compiled(lambda x: -x)(jnp.arange(3.0))
+    (other,) = set(folder.glob("*.program")) - {path}
+    path.write_bytes(other.read_bytes())
+    other.write_bytes(content)
+    run()
+
+
+def test_what_a_caller_wrote_is_known_by_its_program(folder, monkeypatch):
+    """A class of the same name with another method is not taken for the old one."""
+
+    def call(factor):
+        source = f"def __call__(self, x):\n    return {factor} * x\n"
+        body: dict = {}
+        exec(source, body)
+        own = type("Own", (eqx.Module,), {"__call__": body["__call__"]})
+        programs.forget()
+        return compiled(lambda x, *, own: own(x))(jnp.arange(3.0), own=own())
+
+    np.testing.assert_array_equal(call(2.0), [0.0, 2.0, 4.0])
+    np.testing.assert_array_equal(call(3.0), [0.0, 3.0, 6.0])
+    monkeypatch.setattr(store, "_write", lambda *_: pytest.fail("compiled again"))
+    np.testing.assert_array_equal(call(3.0), [0.0, 3.0, 6.0])
+
+
+def test_what_was_not_used_for_longest_goes(folder, monkeypatch):
+    first = program_in(folder)
+    os.utime(first, (1.0, 1.0))
+    monkeypatch.setattr(store, "MAX_BYTES", 2 * first.stat().st_size)
+    for size in (4, 5, 6):
+        double(jnp.zeros(size))
+    assert not first.exists()
+    assert 1 <= len(list(folder.glob("*.program"))) <= 2
+
+
+@pytest.mark.parametrize("emptied", ["ours", "of JAX"])
+def test_it_works_beside_the_folder_of_jax(tmp_path, emptied):
+    """Both keep programs; one of the folders is emptied; every call gives the same."""
+    code = """
+import jax
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+import jaxro
+from jaxro.xla.programs import compiled
+print(compiled(lambda x: 2 * x)(1.5))
+"""
+    ours, of_jax = tmp_path / "ours", tmp_path / "jax"
+    folders = {"JAXRO_CACHE": str(ours), "JAX_COMPILATION_CACHE_DIR": str(of_jax)}
+    for call in range(3):
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | folders,
+            capture_output=True,
+            text=True,
+        )
+        assert done.stdout.strip() == "3.0", done.stderr
+        if call == 0:
+            for file in (ours if emptied == "ours" else of_jax).iterdir():
+                file.unlink()
+
+
+def test_a_stored_program_that_does_not_run_is_compiled_anew(folder, monkeypatch):
+    def broken(*_):
+        raise jax.errors.JaxRuntimeError("NOT_FOUND: function of the program")
+
+    monkeypatch.setattr(store, "_read", lambda *_: (broken, [0]))
+    run()
 
 
 @pytest.mark.parametrize("mode", [0o775, 0o777, 0o2777])

@@ -3,7 +3,7 @@ start."""
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, ScalarLike
 
 from ...geometry.elements import RelativePose
 from ...geometry.pairs import Pair
@@ -30,8 +30,8 @@ class Auto(AbstractStart):
 
     general: AbstractStart = General()
     steps: int = 2
-    tilt: float = 0.35
-    tolerance: float = 1e-3
+    tilt: ScalarLike = 0.35
+    tolerance: ScalarLike = 1e-3
 
     def fits(self, pose: RelativePose, inspected: Inspection) -> Bool[Array, ""]:
         """Whether a pose reached from the vertical is near it and explains the points;

@@ -14,7 +14,7 @@ orthogonal matrices, the same as from a singular value decomposition.
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from ...geometry import rotations as rot
 from ...geometry.elements import RelativePose
@@ -128,7 +128,7 @@ def cofactors(m: Float[Array, "3 3 ..."]) -> Float[Array, "3 3 ..."]:
     return jnp.swapaxes(cross(after, before), 0, 1)
 
 
-def _scaled(m: Square, squares: float) -> Square:
+def _scaled(m: Square, squares: ScalarLike) -> Square:
     """M times the factor that makes the sum of its squares the given one."""
     return m * jnp.sqrt(
         squares / jnp.maximum(jnp.sum(m * m, axis=(0, 1), keepdims=True), TINY)
