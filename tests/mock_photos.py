@@ -1,9 +1,7 @@
 """Photos of given points, for tests of what cannot be oriented."""
 
-from functools import lru_cache
-
-import jax.numpy as jnp
 import numpy as np
+from oracles import wolf
 
 import jaxro
 from jaxro import RESULTS
@@ -11,28 +9,21 @@ from jaxro import RESULTS
 FOCAL = 150.0
 
 
-@lru_cache
-def turned(turn):
-    """Wolf's matrix of (omega, phi, kappa)."""
-    return np.asarray(
-        jaxro.rotations.as_array(
-            jaxro.rotations.m_omega_phi_kappa(*(jnp.asarray(a) for a in turn))
-        )
+def measured(points, turn=(0.0, 0.0, 0.0), base=(1.0, 0.0, 0.0), sigma=0.0, seed=0):
+    """(4, n) coordinates of points (n, 3) given in bases, left photo at the origin
+    looking along -z, right one turned (Wolf)."""
+    points = np.asarray(points, float)
+    right = (points - np.asarray(base)) @ wolf(*turn).T
+    exact = [-FOCAL * p[:, k] / p[:, 2] for p in (points, right) for k in (0, 1)]
+    return (
+        np.stack(exact)
+        + np.random.default_rng(seed).normal(size=(4, len(points))) * sigma
     )
 
 
-def photographed(points, turn=(0.0, 0.0, 0.0), base=(1.0, 0.0, 0.0), sigma=0.0, seed=0):
-    """Photos of points (n, 3) given in bases, left photo at the origin looking along
-    -z, right one turned (Wolf)."""
-    points = np.asarray(points, float)
-    left, right = points, (points - np.asarray(base)) @ turned(turn).T
-    noise = np.random.default_rng(seed).normal(size=(4, len(points))) * sigma
-    coordinates = [-FOCAL * left[:, 0] / left[:, 2], -FOCAL * left[:, 1] / left[:, 2]]
-    coordinates += [
-        -FOCAL * right[:, 0] / right[:, 2],
-        -FOCAL * right[:, 1] / right[:, 2],
-    ]
-    return jaxro.pair(*(np.asarray(coordinates) + noise), focal=FOCAL)
+def photographed(points, **options):
+    """The pair of these photos; options as of `measured`."""
+    return jaxro.pair(*measured(points, **options), focal=FOCAL)
 
 
 def block(n=12, seed=1, depth=(1.5, 2.2)):
@@ -42,9 +33,13 @@ def block(n=12, seed=1, depth=(1.5, 2.2)):
     )
 
 
+PLACES = 20
+"""Pairs of up to so many points share one compiled program."""
+
+
 def outcome(pair, **options):
-    """Up to 20 points share one compiled program."""
-    return jaxro.orient(jaxro.pad(pair, max(20, len(pair.x_left))), **options)
+    """The orientation of a pair in PLACES places."""
+    return jaxro.orient(jaxro.pad(pair, max(PLACES, len(pair.x_left))), **options)
 
 
 def name(orientation):
@@ -63,7 +58,7 @@ def in_any_position(points, count, seed, sigma):
         ground, base = points(rng), rng.normal(size=3)
         base /= np.linalg.norm(base)
         turn = rng.uniform(-1, 1, 2) * 0.5, rng.uniform(-np.pi, np.pi)
-        right = (ground - base) @ turned((*turn[0], turn[1])).T
+        right = (ground - base) @ wolf(*turn[0], turn[1]).T
         if np.all(right[:, 2] < -0.5):
             both = [-FOCAL * p[:, k] / p[:, 2] for p in (ground, right) for k in (0, 1)]
             pairs.append(np.array(both) + rng.normal(size=(4, len(ground))) * sigma)
@@ -86,7 +81,7 @@ def on_a_critical_surface(count, points, seed, sigma):
             rng.normal(size=(2, 3)) * [[1.0], [0.5]],
         )
         first, second = (
-            turned((*a,)).T for a in (angles, angles + rng.normal(size=3) * 0.3)
+            wolf(*a).T for a in (angles, angles + rng.normal(size=3) * 0.3)
         )
         both = [
             (r, b / np.linalg.norm(b))

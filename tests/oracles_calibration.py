@@ -21,7 +21,7 @@ def rays(unknowns, points):
     return seen[:, :2] / seen[:, 2:]
 
 
-def gauss_newton(residuals, x, steps=30):
+def gauss_newton(residuals, x, steps=8):
     """The minimum of the squares of residuals(x), and the inverse of JᵀJ there."""
     for _ in range(steps):
         x = x - np.linalg.lstsq(jacobian(residuals, x), residuals(x), rcond=None)[0]

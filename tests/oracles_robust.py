@@ -18,15 +18,15 @@ def linearised(points, focal, sigma, elements):
     """The whitened condition r = g / (sigma |dg/dl|) and its columns, the denominator
     held."""
     g = lambda e: oracles.condition(PLACED, e, points, (focal, focal))
-    slopes = []
-    for k in range(4):
-        moved = points.astype(complex)
-        moved[k] += 1j * oracles.STEP
-        slopes.append(
-            oracles.condition(PLACED, elements, moved, (focal, focal)).imag
-            / oracles.STEP
-        )
-    spread = sigma * np.sqrt(np.sum(np.square(slopes), axis=0))
+    left, right, base = PLACED(elements)
+    ray1 = oracles.vectors(*points[:2], focal) @ left.T
+    ray2 = oracles.vectors(*points[2:], focal) @ right.T
+    # the condition (b, ray1, ray2) is linear in each of them
+    slopes = [
+        (np.cross(ray2, base) @ left)[:, :2],
+        (np.cross(base, ray1) @ right)[:, :2],
+    ]
+    spread = sigma * np.sqrt(np.sum(np.square(slopes), axis=(0, 2)))
     return g(elements) / spread, oracles.jacobian(g, elements) / spread[:, None]
 
 

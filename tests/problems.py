@@ -50,6 +50,7 @@ def dewitt() -> Pair:
     return pair(*DEWITT, focal=DEWITT_FOCAL)
 
 
+@partial(jax.jit, static_argnums=0)
 def table_1(points: int) -> Pair:
     """The flat mock pair of table 1 with the first `points` points."""
     flat = mock_pairs.mock_pair(
@@ -62,6 +63,7 @@ table_2 = dorozhinsky1971.table_2
 """The flat mock pair of table 2, eight points, errors at points 7 and 8."""
 
 
+@jax.jit
 def tilted(sigma: float = 0.01, seed: int = 0) -> Pair:
     """Sixteen points with relief, photos tilted by a few degrees, normal errors: the
     usual measured pair."""

@@ -4,6 +4,8 @@ import numpy as np
 from oracles_calibration import rays, rotation
 
 SIGMA = 0.05
+FEW, MANY = 14, 50
+"""How many points the tests take: each number is compiled once."""
 
 
 def photos(rng, points, images=4):

@@ -8,6 +8,7 @@ vertical are collected and oriented in a second, smaller pass, so that they do n
 up their chunk.
 """
 
+import math
 import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -38,7 +39,16 @@ from ..xla.settings import (
     WIDE_VECTORS,
     settings_for,
 )
-from ..xla.slabs import Progress, Split, has_caches, map_chunks, silent, spread
+from ..xla.slabs import (
+    SLAB_POINTS,
+    Progress,
+    Split,
+    count_cores,
+    has_caches,
+    map_chunks,
+    silent,
+    spread,
+)
 
 CHUNK_POINTS = 16384
 """Points per chunk: a working set of a few hundred kB, which stays in the cache of one
@@ -222,9 +232,22 @@ def clean_in_stages(
         rest = np.flatnonzero(~decision.believed)
         if rest.size:
             left_over = jax.tree.map(lambda a, rest=rest: a[rest], pairs)
-            new = decide_slabs(left_over, stage, split, silent, settings)
+            own = _few_shapes(stage, left_over, split)
+            new = decide_slabs(left_over, stage, own, silent, settings)
             decision = _replace_rows(decision, rest, new)
     return conclude_slabs(pairs, decision, procedure, select, split)
+
+
+def _few_shapes(stage: AbstractDecider, pairs: Pair, split: Split) -> Split:
+    """How what is left over is split: whatever number of pairs that is, calls have one
+    of few shapes, 4, 16, 64, ... pairs."""
+    split, _ = _split_of(stage, pairs, split)
+    if split.slab is not None or not has_caches():
+        return split
+    total, points = pairs.x_left.shape
+    each = -(-total // (max(split.calls, 1) * count_cores()))
+    few = 4 ** max(1, math.ceil(math.log(max(each, 1), 4)))
+    return split._replace(slab=min(few, max(1, SLAB_POINTS // max(points, 1))))
 
 
 def clean_slabs(

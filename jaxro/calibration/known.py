@@ -45,7 +45,7 @@ def known(
     focal_sigma: ArrayLike = 0.0,
 ) -> Known:
     """A principal place and a focal length with standard deviations."""
-    infinite = jnp.full((), jnp.inf)
+    infinite = jnp.full((), jnp.inf, float)
     at = jnp.zeros(2) if principal is None else jnp.asarray(principal, float)
     of = infinite if principal is None else jnp.asarray(principal_sigma, float)
     return Known(

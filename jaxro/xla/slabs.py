@@ -188,7 +188,7 @@ def _pool() -> ThreadPoolExecutor:
 
 def _count_workers() -> int:
     """Threads that keep every core and every device busy."""
-    return max(_count_cores(), 2 * jax.local_device_count())
+    return max(count_cores(), 2 * jax.local_device_count())
 
 
 def map_chunks(one: Callable, data: PyTree, chunk: int) -> PyTree:
@@ -210,7 +210,7 @@ def map_chunks(one: Callable, data: PyTree, chunk: int) -> PyTree:
     )
 
 
-def _count_cores() -> int:
+def count_cores() -> int:
     """The cores that this process may use; all of the machine where the system does not
     tell."""
     return (

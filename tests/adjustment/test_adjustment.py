@@ -1,6 +1,7 @@
 """The engine is general: networks, lines with errors in both coordinates, vector
 conditions, any solver."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 import jaxro
 from jaxro.adjustment import Term
+
+adjust = eqx.filter_jit(jaxro.adjust)
 
 # Levelling net of four unknown heights over one datum point (0): seven observed
 # differences [m], lengths [km].
@@ -25,10 +28,11 @@ def levelling(heights, observation):
     return every[end] - every[start] - rise
 
 
-def net(rise, solver=None):
+@jax.jit
+def net(rise):
     observations = (jnp.asarray(FROM), jnp.asarray(TO), rise)
     term = Term(levelling, observations, (None, None, jnp.asarray(LENGTH)))
-    return jaxro.adjust(term, jnp.zeros(4), solver=solver)
+    return jaxro.adjust(term, jnp.zeros(4))
 
 
 def test_levelling_net_equals_normal_equations():
@@ -40,7 +44,7 @@ def test_levelling_net_equals_normal_equations():
     x = np.linalg.solve(n, a.T @ (p * RISE))
     v = a @ x - RISE
     q = np.linalg.inv(n)
-    result = jax.jit(net)(jnp.asarray(RISE))
+    result = net(jnp.asarray(RISE))
     assert result.result == jaxro.adjustment.RESULTS.successful
     np.testing.assert_allclose(result.parameters, x, atol=1e-13)
     np.testing.assert_allclose(result.cofactor, q, atol=1e-13)
@@ -54,8 +58,9 @@ def test_levelling_net_equals_normal_equations():
 
 
 def test_derivatives_of_a_linear_net_are_its_generalised_inverse():
-    forward = jax.jacfwd(lambda rise: net(rise).parameters)(jnp.asarray(RISE))
-    reverse = jax.jacrev(lambda rise: net(rise).parameters)(jnp.asarray(RISE))
+    heights = lambda rise: net(rise).parameters
+    both = jax.jit(lambda rise: (jax.jacfwd(heights)(rise), jax.jacrev(heights)(rise)))
+    forward, reverse = both(jnp.asarray(RISE))
     at = lambda step: net(jnp.asarray(RISE + step)).parameters
     moved = np.stack([(at(d) - at(-d)) / 2e-3 for d in 1e-3 * np.eye(7)], axis=1)
     np.testing.assert_allclose(forward, moved, atol=1e-10)
@@ -90,7 +95,7 @@ def test_line_with_errors_in_both_coordinates(solver):
     start = (jnp.asarray(5.0), jnp.asarray(-0.5))
     cofactor = (jnp.asarray(1 / WX), jnp.asarray(1 / WY))
     term = Term(line, (jnp.asarray(X), jnp.asarray(Y)), cofactor)
-    result = jaxro.adjust(term, start, solver=solver, max_steps=100)
+    result = adjust(term, start, solver=solver, max_steps=100)
     assert result.result == jaxro.adjustment.RESULTS.successful
     np.testing.assert_allclose(result.parameters, (5.47991022, -0.480533407), rtol=2e-9)
     np.testing.assert_allclose(result.sigma0**2 * 8, 11.8663532, rtol=1e-8)
@@ -103,11 +108,15 @@ def test_a_variance_may_stand_for_many_entries():
     x, y, variance = jnp.asarray(X), jnp.asarray(Y), jnp.asarray(1 / WX)
     both = jnp.stack([x, y], axis=1)
     variances = jnp.stack([variance, variance], axis=1)
-    written = jaxro.adjust(Term(line, (x, y), (variance, variance)), start)
-    shared = jaxro.adjust(Term(line, (x, y), variance), start)
-    together = jaxro.adjust(Term(line, both, variance), start)
-    entries = jaxro.adjust(Term(line, both, variances), start)
-    for other in (shared, together, entries):
+    terms = [
+        Term(line, (x, y), (variance, variance)),
+        Term(line, (x, y), variance),
+        Term(line, both, variance),
+        Term(line, both, variances),
+    ]
+    every = eqx.filter_jit(lambda terms: [jaxro.adjust(t, start) for t in terms])
+    written, *others = every(terms)
+    for other in others:
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12),
             other,
@@ -133,7 +142,7 @@ def test_vector_conditions_are_whitened_together():
     points = lambda a: tuple(jnp.asarray(column) for column in a.T)
     cofactor = (tuple(var_p.tolist()), tuple(var_q.tolist()))
     start = (jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(0.0))
-    result = jaxro.adjust(Term(motion, (points(p), points(q)), cofactor), start)
+    result = adjust(Term(motion, (points(p), points(q)), cofactor), start)
 
     def objective(x):
         c, s = np.cos(x[0]), np.sin(x[0])
@@ -166,7 +175,7 @@ def test_more_parameters_than_are_unrolled():
     a[np.arange(start.size), start] -= 1
     observations = jnp.asarray(start), jnp.asarray(end), jnp.asarray(rise)
     term = Term(levelling, observations, (None, None, 1.0))
-    result = jaxro.adjust(term, jnp.zeros(20))
+    result = adjust(term, jnp.zeros(20))
     np.testing.assert_allclose(
         result.parameters, np.linalg.lstsq(a[:, 1:], rise, rcond=None)[0], atol=1e-12
     )
@@ -183,5 +192,5 @@ def test_more_parameters_than_are_unrolled():
 
 def test_undetermined_parameter_is_reported():
     legs = jnp.asarray([0, 1, 0]), jnp.asarray([1, 2, 2]), jnp.asarray([1.0, 1.0, 2.1])
-    result = jaxro.adjust(Term(levelling, legs, (None, None, 1.0)), jnp.zeros(3))
+    result = adjust(Term(levelling, legs, (None, None, 1.0)), jnp.zeros(3))
     assert result.result == jaxro.adjustment.RESULTS.rank_deficient

@@ -39,10 +39,13 @@ def places(
     return np.concatenate([xy, rng.uniform(-8, 8, (pairs, 1, points))], axis=1)
 
 
+AT_ONCE = 500
+"""Pairs of one call: every number of pairs goes by the same programs."""
+
+
 @cache
 def programs():
-    """The errorless pairs; the orientation from their errors and the test; each
-    compiled once a shape."""
+    """The errorless pairs; the orientation from their errors and the test."""
     elements = IndependentElements(*(jnp.asarray(e) for e in ELEMENTS))
 
     def ideal(place) -> Pair:
@@ -57,9 +60,24 @@ def programs():
         )
         return neighbours.of_linear(linearise(pair, pose), pair.coordinates)
 
-    return jax.jit(jax.vmap(ideal)), jax.jit(
-        lambda *a: jax.lax.map(lambda one: solved(*one), a, batch_size=50)
+    return at_once(jax.jit(jax.vmap(ideal))), at_once(
+        jax.jit(lambda *a: jax.lax.map(lambda one: solved(*one), a, batch_size=50))
     )
+
+
+def at_once(program):
+    """A program of any number of pairs, by calls of AT_ONCE; the last is filled up by
+    repetition."""
+
+    def every(*data):
+        count = len(data[0])
+        rows = np.resize(np.arange(count), -(-count // AT_ONCE) * AT_ONCE)
+        parts = [
+            program(*(a[k] for a in data)) for k in np.split(rows, len(rows) // AT_ONCE)
+        ]
+        return jax.tree.map(lambda *a: jnp.concatenate(a)[:count], *parts)
+
+    return every
 
 
 def correlated_errors(
@@ -103,7 +121,7 @@ def test_level_and_power():
     assert abs(flagged - 0.05) < 0.015
     found = judged(40, False, 200, rho=0.5)
     assert np.mean(np.asarray(found.probability) < 0.05) > 0.33
-    together = jax.vmap(pool)(jax.tree.map(lambda a: a.reshape(-1, 10), found))
+    together = jax.jit(jax.vmap(pool))(jax.tree.map(lambda a: a.reshape(-1, 10), found))
     assert np.all(np.asarray(together.probability) < 0.05)
     np.testing.assert_allclose(np.median(together.rho), 0.5, atol=0.15)
     np.testing.assert_allclose(np.median(together.length), 0.1 * PHOTO, rtol=0.4)
@@ -197,11 +215,11 @@ def test_padding_and_sigma_change_nothing():
 
 @pytest.mark.parametrize("elements", [jaxro.RelativePose, IndependentElements])
 def test_correlated_covariance_is_the_scatter(elements):
-    """The deviations of 2,000 orientations from correlated errors; without correlation
-    those of the adjustment."""
+    """The deviations of AT_ONCE orientations from correlated errors, which are known to
+    a thirtieth; without correlation those of the adjustment."""
     rng = np.random.default_rng(5)
     ideal, _ = programs()
-    place = np.repeat(places(40, False, 1, rng), 2_000, axis=0)
+    place = np.repeat(places(40, False, 1, rng), AT_ONCE, axis=0)
     pairs = ideal(place)
     errors = correlated_errors(pairs, 0.5, 40.0, rng)
     measured = [

@@ -44,7 +44,12 @@ assessed = partial(problems.jit, static_argnames=("level", "power", "familywise"
 def measured(layout=None, elements=NEAR, sigma=0.0, seed=0, relief=8.0):
     """A pair in the given position with relief and normal errors."""
     layout = mock_pairs.row_layout() if layout is None else layout
-    keys = jax.random.split(jax.random.key(seed))
+    return photographed(layout, elements, sigma, jax.random.key(seed), relief)
+
+
+@partial(problems.jit, static_argnums=0)
+def photographed(layout, elements, sigma, key, relief):
+    keys = jax.random.split(key)
     at = IndependentElements(*(jnp.asarray(e) for e in elements))
     heights = mock_pairs.relief(keys[0], layout, relief)
     return mock_pairs.noisy(

@@ -41,24 +41,32 @@ def program():
     )
 
 
-def batch(elements, sigma, count, seed=0):
-    """`count` pairs of sixteen points; sigma: (4, 16) standard deviations of the
-    coordinates."""
+COUNT = 2_000
+SIGMAS = {
+    "by class": np.broadcast_to(np.where(CLASSES, LARGE, SMALL), (4, 16)),
+    "by photo": np.repeat([[SMALL], [SMALL], [LARGE], [LARGE]], 16, axis=1),
+    "1 : 3 : 9": np.broadcast_to(SMALL * 3.0 ** (np.arange(16) % 3), (4, 16)),
+}
+SIGMAS["few good"] = np.where(np.arange(16) < 6, SIGMAS["by photo"] / 4, 2 * LARGE)
+"""Standard deviations of the coordinates, (4, 16)."""
+
+
+@lru_cache
+def batch(elements, sigmas, seed=0):
+    """COUNT pairs of sixteen points, and their orientations."""
     true = IndependentElements(*(jnp.asarray(e) for e in elements))
     layout = mock_pairs.row_layout()
     heights = mock_pairs.relief(jax.random.key(5), layout, 10.0)
     clean = mock_pairs.mock_pair(layout, true, focal=FOCAL, base=BASE, heights=heights)
-    return program()(
-        clean, true, jax.random.split(jax.random.key(seed), count), jnp.asarray(sigma)
-    )
+    keys = jax.random.split(jax.random.key(seed), COUNT)
+    return program()(clean, true, keys, SIGMAS[sigmas])
 
 
-def by_class():
-    return np.broadcast_to(np.where(CLASSES, LARGE, SMALL), (4, 16))
-
-
-def by_photo():
-    return np.repeat([[SMALL], [SMALL], [LARGE], [LARGE]], 16, axis=1)
+def tables(pairs, found, count, size, groups):
+    """The components of `count` tables of `size` pairs each."""
+    part = lambda a: a[: count * size].reshape(count, size, *a.shape[1:])
+    every = jax.tree.map(part, (pairs, found))
+    return jax.jit(jax.vmap(lambda p, o: components.estimate(p, o, groups)))(*every)
 
 
 def within_two(found, truth):
@@ -76,21 +84,17 @@ def within_two(found, truth):
 def test_steps_do_not_run_in_a_circle():
     """Three classes 1 : 3 : 9 in thirty pairs, where the first steps make the small
     variance negative."""
-    classes, truth = np.arange(16) % 3, np.array([0.005, 0.015, 0.045])
-    for seed in range(40):
-        pairs, found = batch(NEAR, np.broadcast_to(truth[classes], (4, 16)), 30, seed)
-        result = components.estimate(pairs, found, (classes,) * 4)
-        assert bool(result.converged) and bool(
-            result.estimable[1] & result.estimable[2]
-        )
-        np.testing.assert_allclose(result.sigma[1:], truth[1:], rtol=0.4)
-        assert abs(float(result.sigma[0]) ** 2 - truth[0] ** 2) < 4 * float(
-            result.variance_error[0]
-        )
+    truth = np.array([0.005, 0.015, 0.045])
+    found = tables(*batch(NEAR, "1 : 3 : 9"), 40, 30, (np.arange(16) % 3,) * 4)
+    assert np.all(found.converged) and np.all(found.estimable[:, 1:])
+    sigma = np.asarray(found.sigma)
+    np.testing.assert_allclose(sigma[:, 1:], np.tile(truth[1:], (40, 1)), rtol=0.4)
+    off = np.abs(sigma[:, 0] ** 2 - truth[0] ** 2)
+    assert np.all(off < 4 * np.asarray(found.variance_error)[:, 0])
 
 
 def test_classes_of_points_in_near_vertical_pairs():
-    pairs, found = batch(NEAR, by_class(), 2_000)
+    pairs, found = batch(NEAR, "by class")
     groups = (CLASSES.astype(int),) * 4
     result = components.estimate(pairs, found, groups)
     within_two(result, (SMALL, LARGE))
@@ -105,7 +109,7 @@ def test_classes_of_points_in_near_vertical_pairs():
 
 
 def test_both_photos_of_convergent_pairs():
-    pairs, found = batch(CONVERGENT, by_photo(), 2_000)
+    pairs, found = batch(CONVERGENT, "by photo")
     result = components.by_photo(pairs, found)
     within_two(result, (SMALL, LARGE))
     assert np.all(result.standard_error < 1e-3)
@@ -115,7 +119,7 @@ def test_both_photos_of_convergent_pairs():
 def test_y_of_left_and_right_photo():
     """In convergent pairs y of both photos; x, which hardly enters, in a group of its
     own and told to be unknown."""
-    pairs, found = batch(CONVERGENT, by_photo(), 2_000)
+    pairs, found = batch(CONVERGENT, "by photo")
     result = components.estimate(pairs, found, (0, 1, 0, 2))
     assert np.all(result.estimable[1:])
     for k, sigma in ((1, SMALL), (2, LARGE)):
@@ -124,14 +128,14 @@ def test_y_of_left_and_right_photo():
 
 def test_what_is_not_estimable_is_told():
     """Near-vertical pairs know y of both photos only together, and nothing of x."""
-    pairs, found = batch(NEAR, by_photo(), 2_000)
+    pairs, found = batch(NEAR, "by photo")
     result = components.estimate(pairs, found, (0, 1, 0, 1))
     np.testing.assert_array_equal(result.estimable, [False, True])
     assert result.sigma[0] == 0 and np.isinf(result.standard_error[0])
     assert abs(float(result.sigma[1]) ** 2 - (SMALL**2 + LARGE**2) / 2) < 2 * float(
         result.variance_error[1]
     )
-    vertical = batch((0.0,) * 5, by_photo(), 2_000)
+    vertical = batch((0.0,) * 5, "by photo")
     result = components.estimate(*vertical, (0, 1, 0, 2))
     assert (
         not np.any(result.estimable)
@@ -145,8 +149,7 @@ def test_an_estimable_group_beside_others_that_are_not():
     """Few good points in vertical pairs, y of their photos not to be told apart: the
     others are estimated as well."""
     few = np.arange(16) < 6
-    sigma = np.where(few, by_photo() / 4, 2 * LARGE)
-    pairs, found = batch((0.0,) * 5, sigma, 2_000)
+    pairs, found = batch((0.0,) * 5, "few good")
     left, right = (np.where(few, k, 2) for k in (0, 1))
     result = components.estimate(pairs, found, (left, left, right, right))
     np.testing.assert_array_equal(result.estimable, [False, False, True])
@@ -157,7 +160,7 @@ def test_an_estimable_group_beside_others_that_are_not():
 def test_restricted_likelihood_is_largest():
     """The maximum over both variances, found by SciPy on dense matrices of all
     pairs."""
-    pairs, found = batch(CONVERGENT, by_photo(), 120)
+    pairs, found = jax.tree.map(lambda a: a[:120], batch(CONVERGENT, "by photo"))
     result = components.by_photo(pairs, found)
     parts = []
     for i in range(120):
@@ -212,10 +215,9 @@ def test_restricted_likelihood_is_largest():
 def test_standard_errors_are_those_of_repetition():
     """A hundred times twenty pairs: the estimates scatter as their standard errors
     say."""
-    pairs, found = batch(NEAR, by_class(), 2_000, seed=3)
+    pairs, found = batch(NEAR, "by class", seed=3)
     groups = (CLASSES.astype(int),) * 4
-    split = jax.tree.map(lambda a: a.reshape(100, 20, *a.shape[1:]), (pairs, found))
-    many = jax.jit(jax.vmap(lambda p, o: components.estimate(p, o, groups)))(*split)
+    many = tables(pairs, found, 100, 20, groups)
     assert np.all(many.estimable)
     for k, sigma in enumerate((SMALL, LARGE)):
         spread = np.std(np.asarray(many.sigma[:, k]) ** 2)
@@ -229,7 +231,7 @@ def test_standard_errors_are_those_of_repetition():
 
 
 def test_groups_must_be_numbered():
-    pairs, found = batch(NEAR, by_class(), 2_000)
+    pairs, found = batch(NEAR, "by class")
     with pytest.raises(ValueError, match="without gaps"):
         components.estimate(pairs, found, (0, 2, 0, 2))
     with pytest.raises(ValueError, match="four groups"):

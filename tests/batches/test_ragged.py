@@ -93,7 +93,7 @@ def test_pairs_of_one_length(pairs, length, size):
     np.testing.assert_allclose(found.parallax, both.parallax[: 4 * length], atol=1e-11)
     kept = ragged.clean_ragged(
         ragged.join(even),
-        PROCEDURES["three-sigma"],
+        PROCEDURES["worst-point"],
         plan=padding.Plan((size,), (4,), (12,)),
     ).kept
     assert kept.shape == (4 * length,)

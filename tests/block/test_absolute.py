@@ -268,7 +268,7 @@ def test_model_of_a_pair_is_the_bundle_of_its_photos():
     coordinates = np.concatenate([photo(pose, ground) for pose in poses], axis=1)
     coordinates = coordinates + rng.normal(0, SIGMA, coordinates.shape)
     pair = jaxro.pair(*coordinates.T, focal=FOCAL, sigma=SIGMA)
-    oriented = jaxro.orient(pair).check()
+    oriented = jaxro.orient(pair, start=jaxro.starts.Vertical()).check()
     given = np.where(np.arange(16)[:, None] < 5, ground, np.nan)
     given[:5] += rng.normal(0, 0.05, (5, 3))
     given[3, :2] = np.nan

@@ -16,7 +16,7 @@ FRAME = {"focal": 153.0, "half_sides": 115.0, "sigma": 0.005}
 @pytest.fixture(scope="module")
 def flown():
     """A simulated block, and its plan: the truth of stations and points."""
-    mock = block.mock_block(3, block.Flight(strips=2, models=6))
+    mock = block.mock_block(3, block.Flight(strips=2, models=4))
     start = start_from(mock.block, mock.photos)._replace(points=mock.points)
     return mock, start
 

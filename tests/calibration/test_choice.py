@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+import simulated_image
 from deformed_film import film
 from oracles_calibration import scene
+from simulated_image import LENS, ONE, SIGMA, N
 
 from jaxro import calibration
 from jaxro.calibration import Brown, Field, Model
-
-SIGMA = 0.006
 
 
 def images(seed, n, distort):
@@ -17,8 +17,7 @@ def images(seed, n, distort):
     _, _, points, places = scene(rng, n + 100)
     places = places + distort(rng, places) + [100.0, 50.0]
     noisy = places[:n] + rng.normal(0, SIGMA, (n, 2))
-    image = calibration.image(*noisy.T, points[:n], sigma=SIGMA, y_down=True)
-    return image, places[n:], points[n:]
+    return simulated_image.image(points[:n], noisy), places[n:], points[n:]
 
 
 def radial(rng, places):
@@ -34,35 +33,36 @@ def error(found, places, points):
     return float(np.sqrt(np.mean(np.asarray(found.misfits(places, points)) ** 2)))
 
 
-LENS = Model(brown=Brown())
-FEW = (
-    Model(),
-    Model(brown=Brown(1, tangential=False, affinity=False, shear=False)),
-    LENS,
-    *(
+def fields(lengths):
+    """Displacement fields of these lengths, alone and with Brown's lens."""
+    return [
         Model(brown=lens, field=Field(length, strength))
         for lens in (None, Brown())
-        for length in (0.8, 1.25)
+        for length in lengths
         for strength in (10.0, 100.0)
-    ),
-)
+    ]
+
+
+RADIAL = Model(brown=Brown(1, tangential=False, affinity=False, shear=False))
+FEW = (ONE, RADIAL, LENS, *fields([0.8]))
+MORE = (ONE, RADIAL, LENS, *fields([0.8, 1.25]))
 
 
 def test_the_model_that_an_image_needs():
     expected = {
-        nothing: lambda model: model == FEW[0],
-        radial: lambda model: model == FEW[1],
+        nothing: lambda model: model == ONE,
+        radial: lambda model: model == RADIAL,
         film: lambda model: model.field is not None,
     }
     for distort, right in expected.items():
-        image, places, points = images(1, 60, distort)
+        image, places, points = images(1, N, distort)
         found, compared = calibration.choose(image, FEW)
         assert right(compared.best)
         assert np.all(np.isfinite(compared.figures.score))
         own = error(found.check(), places, points)
         best = min(
             error(calibration.calibrate(image, model), places, points)
-            for model in (FEW[0], FEW[1], LENS)
+            for model in (ONE, RADIAL, LENS)
         )
         assert own < (best / 3 if distort is film else 1.1 * best)
         number = int(np.argmin(np.asarray(compared.figures.score)))
@@ -81,7 +81,7 @@ def test_film_that_is_deformed_by_a_millimetre(n):
     for seed in range(10):
         image, places, points = images(seed, n, film)
         found, _ = calibration.choose(image)
-        others = (calibration.calibrate(image, model) for model in (Model(), LENS))
+        others = (calibration.calibrate(image, model) for model in (ONE, LENS))
         own = error(found, places, points)
         gains.append([error(other, places, points) / own for other in others])
     over_one, over_brown = np.median(gains, axis=0)
@@ -97,8 +97,8 @@ def test_the_choice_is_hardly_worse_than_the_best_model(n, distort):
     regrets = []
     for seed in range(7):
         image, places, points = images(seed, n, distort)
-        found, _ = calibration.choose(image, FEW)
-        every = (calibration.calibrate(image, model) for model in FEW)
+        found, _ = calibration.choose(image, MORE)
+        every = (calibration.calibrate(image, model) for model in MORE)
         errors = [error(one, places, points) for one in every]
         regrets.append(error(found.check(), places, points) / np.nanmin(errors))
     assert np.median(regrets) < 1.25

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from deformed_film import film
 from oracles_calibration import rays, rotation
-from several_images import SIGMA, olympus, photos
+from several_images import MANY, SIGMA, olympus, photos
 
 from jaxro import calibration
 from jaxro.calibration import Brown, Field, Model
 from jaxro.calibration.choice_together import STRENGTHS, adjust_model
 from jaxro.calibration.known import NOTHING
 from jaxro.calibration.problem_together import approximate
+from jaxro.xla.programs import compiled
+
+MODELS = (Model(), Model(brown=Brown()), Model(field=Field(0.8, 1.0)))
 
 
 def deformed(places):
@@ -21,9 +24,9 @@ def deformed(places):
     return places + 20 * SIGMA * np.stack([np.sin(2 * u[:, 1]), np.cos(3 * u[:, 0])], 1)
 
 
-def survey(seed, points=50):
+def survey(seed):
     rng = np.random.default_rng(seed)
-    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (points, 3))
+    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (MANY, 3))
     truth, image, point, places = photos(rng, points)
     return points, truth, image, point, places
 
@@ -35,16 +38,14 @@ def test_the_linear_problem_tells_the_evidence_of_all_strengths():
     measured = calibration.images(
         *deformed(places).T, image, point, points, sigma=SIGMA
     )
-    begin = approximate(measured, calibration.perspective)
-    model = (Model(field=Field(0.8, 1.0)),)
+    begin = compiled(approximate)(measured, rays=MODELS[0].rays)
 
     def tried(number):
         strength = jnp.asarray(STRENGTHS[number])
-        data = measured, NOTHING, begin, jnp.asarray(0), strength
-        return adjust_model(data, model)
+        return adjust_model(measured, NOTHING, begin, 2, strength, models=MODELS)
 
     first, second = tried(13), tried(16)
-    unknowns = model[0].unknowns * np.log(2.0 * len(places))
+    unknowns = MODELS[2].unknowns * np.log(2.0 * len(places))
     for one in (first, second):
         scores = np.asarray(one.scores) + unknowns
         apart = abs(scores[13] - scores[16])
@@ -60,8 +61,7 @@ def test_a_field_is_chosen_where_there_is_one(bent):
     points, truth, image, point, places = survey(1)
     taken = deformed(places) if bent else places
     measured = calibration.images(*taken.T, image, point, points, sigma=SIGMA)
-    models = [Model(), Model(brown=Brown()), Model(field=Field(0.8, 1.0))]
-    found, compared = calibration.choose_together(measured, models)
+    found, compared = calibration.choose_together(measured, MODELS)
     assert found.usable
     assert (compared.best.field is not None) == bent
     assert 0.85 < float(found.sigma0) < 1.15
@@ -82,7 +82,8 @@ def residuals(found, places, points, image, point):
     """The residuals of new points with known coordinates."""
     normal = found.frame.normal_points(jnp.asarray(points))
     with_new = eqx.tree_at(lambda f: f.adjustment.parameters["point"], found, normal)
-    return np.asarray(with_new.residuals(places, image, point))
+    of_new = eqx.filter_jit(type(found).residuals)
+    return np.asarray(of_new(with_new, places, image, point))
 
 
 @pytest.mark.slow

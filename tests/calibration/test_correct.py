@@ -2,28 +2,21 @@
 
 import numpy as np
 from oracles_calibration import rotation, scene
+from simulated_image import LENS, SIGMA, TWO, N, image
 
 import jaxro
 from jaxro import calibration
-from jaxro.calibration import Brown, Model, Whole
-
-SIGMA = 0.006
 
 
 def test_corrected_coordinates_are_those_of_an_ideal_camera():
     """Of a stretched and lens-distorted image, without errors."""
     rng = np.random.default_rng(2)
-    _, _, points, ideal = scene(rng, 80)
+    _, _, points, ideal = scene(rng, 2 * N)
     r2 = np.sum(ideal**2, axis=1, keepdims=True)
     places = ideal * (1 - 1e-5 * r2) + [100.0, 50.0]
-    known, new = slice(0, 40), slice(40, 80)
-    noise = rng.normal(0, SIGMA, (40, 2))
-    image = calibration.image(
-        *(places[known] + noise).T, points[known], sigma=SIGMA, y_down=True
-    )
-    found = calibration.calibrate(
-        image, Model(brown=Brown(2, affinity=False, shear=False))
-    ).check()
+    known, new = slice(0, N), slice(N, 2 * N)
+    noisy = places[known] + rng.normal(0, SIGMA, (N, 2))
+    found = calibration.calibrate(image(points[known], noisy), LENS).check()
     new_places = np.vstack([places[new], [[160.0, 50.0]]])
     corrected = calibration.correct(found, new_places)
     assert not corrected.inside[-1] and corrected.inside[:-1].mean() > 0.6
@@ -42,7 +35,7 @@ def test_corrected_coordinates_are_those_of_an_ideal_camera():
 def test_two_corrected_photos_are_a_pair():
     """From raw coordinates of two stretched photos to their relative orientation."""
     rng = np.random.default_rng(3)
-    points = rng.uniform([-3, -3, -2], [3, 3, 2], (40, 3))
+    points = rng.uniform([-3, -3, -2], [3, 3, 2], (N, 3))
     sides, truths = [], []
     for x, angle in ((-2.0, -0.15), (2.0, 0.15)):
         turn = rotation(0.05, angle, 0.1 * x)
@@ -50,8 +43,7 @@ def test_two_corrected_photos_are_a_pair():
         ideal = -60 * seen[:, :2] / seen[:, 2:]
         places = ideal * [1.01, -1.0] + [100.0, 50.0]  # stretched, y down
         noisy = places + rng.normal(0, SIGMA, places.shape)
-        image = calibration.image(*noisy.T, points, sigma=SIGMA, y_down=True)
-        found = calibration.calibrate(image, Model(y=Whole())).check()
+        found = calibration.calibrate(image(points, noisy), TWO).check()
         sides.append(calibration.correct(found, noisy))
         truths.append(turn)
     left, right = sides

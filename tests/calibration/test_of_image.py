@@ -5,33 +5,34 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from oracles_calibration import rays, scene
+import simulated_image
+from oracles_calibration import scene
+from several_images import FEW, SIGMA, photos
+from simulated_image import LENS
 
 from jaxro import calibration
-from jaxro.calibration import Brown, Model
 from jaxro.calibration.distortion import distortion_deviations
 from jaxro.calibration.of_image import of_image
-
-SIGMA = 0.05
 
 
 def test_an_image_of_several_has_their_numbers():
     """Station, camera, deviations and residuals are those of the common adjustment."""
     rng = np.random.default_rng(4)
-    points = rng.uniform([-3, -3, -2], [3, 3, 2], (20, 3))
-    stations = [
-        [0.3, -0.1, 0, 0, 3, 9],
-        [-0.3, 0, 0.8, 1, -3, 9],
-        [0, 0.3, 1.6, 3, 0, 10],
-    ]
-    places = [900 * rays(np.array(one), points) + [512, 384] for one in stations]
-    places = np.concatenate(places) + rng.normal(0, SIGMA, (60, 2))
-    image, point = np.repeat(np.arange(3), 20), np.tile(np.arange(20), 3)
-    given = np.where((np.arange(20) % 2 == 0)[:, None], points, np.nan)
+    points = rng.uniform([-3, -3, -2], [3, 3, 2], (FEW, 3))
+    _, image, point, places = photos(rng, points)
+    given = np.where((np.arange(FEW) % 2 == 0)[:, None], points, np.nan)
     measured = calibration.images(*places.T, image, point, given, sigma=SIGMA)
-    several = calibration.calibrate_together(measured, Model(brown=Brown(2)))
+    several = calibration.calibrate_together(measured, LENS)
+    left = eqx.filter_jit(type(several).residuals)(several, places, image, point)
+
+    @eqx.filter_jit
+    def of(k, places, points):
+        one = of_image(several, k)
+        return one, one.misfits(places, points)
+
     for k in (0, 2):
-        one = jax.jit(of_image)(several, jnp.asarray(k))
+        own = image == k
+        one, misfits = of(jnp.asarray(k), places[own], several.points[point[own]])
         np.testing.assert_allclose(one.centre, several.centres[k], rtol=1e-9)
         deviations = several.centre_deviations[k]
         np.testing.assert_allclose(one.centre_deviations, deviations, rtol=1e-6)
@@ -39,11 +40,8 @@ def test_an_image_of_several_has_their_numbers():
             one.focal_deviations, several.focal_deviations[0], rtol=1e-6
         )
         np.testing.assert_allclose(one.principal, several.principal[0], rtol=1e-9)
-        own = image == k
-        left = several.residuals(places, image, point)[own]
-        misfits = one.misfits(places[own], several.points[point[own]])
         # the distortion changes little over a residual
-        np.testing.assert_allclose(misfits, -left, rtol=0.01, atol=1e-3 * SIGMA)
+        np.testing.assert_allclose(misfits, -left[own], rtol=0.01, atol=1e-3 * SIGMA)
         assert one.measured.mask.sum() == len(places)
 
 
@@ -53,9 +51,8 @@ def test_deviations_of_the_distortion_are_those_of_plain_algebra():
     rng = np.random.default_rng(5)
     _, _, points, ideal = scene(rng, 40)
     places = ideal * (1 - 1e-5 * np.sum(ideal**2, axis=1, keepdims=True))
-    noisy = places + rng.normal(0, 0.006, places.shape)
-    image = calibration.image(*noisy.T, points, sigma=0.006, y_down=True)
-    found = calibration.calibrate(image, Model(brown=Brown()))
+    noisy = places + rng.normal(0, simulated_image.SIGMA, places.shape)
+    found = calibration.calibrate(simulated_image.image(points, noisy), LENS)
     covariance = np.asarray(found.covariance)[6:, 6:]
 
     def moved(k, step):

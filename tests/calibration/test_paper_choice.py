@@ -2,27 +2,20 @@
 
 import numpy as np
 import pytest
-from oracles_calibration import scene
+import simulated_image
 from scipy import stats
+from simulated_image import LENS, ONE, STRIPS, TURNED, TWO, N
 
 from jaxro import calibration
-from jaxro.calibration import Brown, Model, Whole, rectangles, strips_along_x
 from jaxro.calibration.paper_choice import Units, choose_as_paper, paper_models
 
-SIGMA = 0.006
-MODELS = (
-    Model(),
-    Model(y=Whole()),
-    Model(x=strips_along_x(2)),
-    Model(x=rectangles(2, 2), y=rectangles(2, 2)),
-)
+MODELS = (ONE, TWO, STRIPS, TURNED)
 
 
-def image(n=60):
-    rng = np.random.default_rng(5)
-    _, _, points, places = scene(rng, n)
-    places = places * [1.003, 1.0] + rng.normal(0, SIGMA, places.shape)
-    return calibration.image(*places.T, points, sigma=SIGMA, y_down=True)
+def image(mask=None):
+    """Of a film that is stretched along x."""
+    _, points, places = simulated_image.measured(5, distort=lambda m: m * [1.003, 1.0])
+    return simulated_image.image(points, places, mask=mask)
 
 
 def test_the_rules_of_the_paper():
@@ -67,18 +60,27 @@ def test_the_rules_of_the_paper():
     assert found.by_score == 1  # the film is stretched along x
 
 
-def test_the_units_matter():
+@pytest.mark.parametrize(
+    "models", [MODELS, pytest.param(paper_models(), marks=pytest.mark.slow)]
+)
+def test_the_units_matter(models):
     measured = image()
     raw, mixed = (
-        choose_as_paper(measured, units=units) for units in (Units(), Units(1e3, 1e3))
+        choose_as_paper(measured, models, units=units)
+        for units in (Units(), Units(1e3, 1e3))
     )
     assert raw.depends_on_units and mixed.depends_on_units
     assert raw.picks[:2] != mixed.picks[:2]
-    assert len(raw.models) == len(paper_models()) == 26
+
+
+@pytest.mark.slow
+def test_the_models_of_the_paper_are_the_default():
+    assert choose_as_paper(image()).models == paper_models()
+    assert len(paper_models()) == 26
 
 
 def test_what_the_paper_does_not_choose_from():
     with pytest.raises(ValueError, match="focal lengths alone"):
-        choose_as_paper(image(), [Model(brown=Brown())])
+        choose_as_paper(image(), [LENS])
     with pytest.raises(RuntimeError, match="no model can be adjusted"):
-        choose_as_paper(image(4), [Model(x=rectangles(3, 3))])
+        choose_as_paper(image(np.arange(N) < 4), MODELS)

@@ -3,10 +3,16 @@
 import numpy as np
 import pytest
 from oracles_calibration import gauss_newton, rays
-from several_images import SIGMA, olympus, photos
+from several_images import FEW, MANY, SIGMA, olympus, photos
 
 from jaxro import calibration
 from jaxro.calibration import Brown, Model
+
+
+def rays_of(stations, points, image, point):
+    """x/z, y/z of these points in these images, one after the other."""
+    every = np.array([rays(station, points) for station in stations])
+    return every[image, point]
 
 
 @pytest.mark.parametrize(
@@ -16,7 +22,7 @@ def test_stations_and_points_are_those_of_a_dense_adjustment(depth, focal_sigma)
     """Of a plane field of targets and of a solid one; six points are known, and the
     focal length may be."""
     rng = np.random.default_rng(4)
-    points = rng.uniform([-3, -3, -depth], [3, 3, depth], (14, 3))
+    points = rng.uniform([-3, -3, -depth], [3, 3, depth], (FEW, 3))
     points[[0, 2, 4, 6, 8, 10], :2] = [
         [-3, -3],
         [3, -3],
@@ -26,17 +32,15 @@ def test_stations_and_points_are_those_of_a_dense_adjustment(depth, focal_sigma)
         [1, -2],
     ]
     truth, image, point, places = photos(rng, points)
-    known = np.isin(np.arange(14), [0, 2, 4, 6, 8, 10])
+    known = np.isin(np.arange(FEW), [0, 2, 4, 6, 8, 10])
     given = np.where(known[:, None], points, np.nan)
 
     def residuals(unknowns):
         stations = unknowns[:24].reshape(4, 6)
         moved = points.copy()
         moved[~known] = unknowns[27:].reshape(-1, 3)
-        found = [
-            rays(stations[i], moved[[p]])[0] for i, p in zip(image, point, strict=True)
-        ]
-        misfits = (places - unknowns[25:27] - unknowns[24] * np.array(found)) / SIGMA
+        seen = unknowns[25:27] + unknowns[24] * rays_of(stations, moved, image, point)
+        misfits = (places - seen) / SIGMA
         return np.append(misfits, (unknowns[24] - 900.1) / focal_sigma)
 
     begin = np.concatenate([truth.ravel(), [900, 512, 384], points[~known].ravel()])
@@ -46,7 +50,12 @@ def test_stations_and_points_are_those_of_a_dense_adjustment(depth, focal_sigma)
     deviations = sigma0 * np.sqrt(np.diag(q))
 
     measured = calibration.images(*places.T, image, point, given, sigma=SIGMA)
-    focal = calibration.known(focal=900.1, focal_sigma=focal_sigma)
+    focal = calibration.known(
+        principal=(512.0, 384.0),
+        principal_sigma=np.inf,
+        focal=900.1,
+        focal_sigma=focal_sigma,
+    )
     found = calibration.calibrate_together(measured, known=focal)
     assert found.usable
     np.testing.assert_allclose(found.sigma0, sigma0, rtol=1e-6)
@@ -71,7 +80,7 @@ def test_a_free_network_has_the_inner_geometry_of_any_datum():
     whose datum is one station and a coordinate of the next; and the stations have the
     smallest variances, whose datum moves none of them as a whole."""
     rng = np.random.default_rng(6)
-    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (12, 3))
+    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (FEW, 3))
     truth, image, point, places = photos(rng, points)
 
     def residuals(unknowns):
@@ -79,12 +88,8 @@ def test_a_free_network_has_the_inner_geometry_of_any_datum():
         stations = np.concatenate([stations, unknowns[2:14]]).reshape(4, 6)
         stations[1, :3] = unknowns[17:20]
         moved = unknowns[20:].reshape(-1, 3)
-        found = [
-            rays(stations[i], moved[[p]])[0] for i, p in zip(image, point, strict=True)
-        ]
-        return (
-            (places - unknowns[15:17] - unknowns[14] * np.array(found)) / SIGMA
-        ).ravel()
+        seen = unknowns[15:17] + unknowns[14] * rays_of(stations, moved, image, point)
+        return ((places - seen) / SIGMA).ravel()
 
     inner = [900, 512, 384, *truth[1, :3]]
     begin = [*truth[1, 3:5], *truth[2:].ravel(), *inner, *points.ravel()]
@@ -107,10 +112,10 @@ def test_a_free_network_has_the_inner_geometry_of_any_datum():
 def test_variance_components_of_places_and_known_points():
     """Places are twice as good as was said, control points three times as bad."""
     rng = np.random.default_rng(7)
-    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (60, 3))
+    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (MANY, 3))
     _, image, point, places = photos(rng, points)
-    known = np.arange(60) < 40
-    given = np.where(known[:, None], points + rng.normal(0, 0.003, (60, 3)), np.nan)
+    known = np.arange(MANY) < 40
+    given = np.where(known[:, None], points + rng.normal(0, 0.003, (MANY, 3)), np.nan)
     measured = calibration.images(
         *places.T, image, point, given, sigma=2 * SIGMA, point_sigma=0.001
     )
@@ -124,10 +129,12 @@ def test_variance_components_of_places_and_known_points():
         calibration.estimate_components(fixed)
 
 
+@pytest.mark.slow
 def test_cameras_of_their_own():
-    """Two cameras of different focal lengths took two images each."""
+    """Two cameras of different focal lengths took two images each; that every image can
+    have a camera of its own is tested with the command."""
     rng = np.random.default_rng(8)
-    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (40, 3))
+    points = rng.uniform([-3, -3, -1.5], [3, 3, 1.5], (MANY, 3))
     truth, image, point, places = photos(rng, points)
     second = image >= 2
     places[second] = (places[second] - [512, 384]) * 1.2 + [500, 390]
@@ -144,12 +151,12 @@ def test_cameras_of_their_own():
 
 def test_what_does_not_hang_together_is_refused():
     rng = np.random.default_rng(4)
-    points = rng.uniform(-3, 3, (14, 3))
+    points = rng.uniform(-3, 3, (FEW, 3))
     _, image, point, places = photos(rng, points)
     nothing = np.full_like(points, np.nan)
     with pytest.raises(ValueError, match="an image needs 4 points"):
         calibration.images(*places.T, image, point, nothing)
-    once = np.where(np.arange(14)[:, None] == 3, np.nan, points)
+    once = np.where(np.arange(FEW)[:, None] == 3, np.nan, points)
     few = (image == 0) | (point != 3)
     with pytest.raises(ValueError, match="point 3 is unknown and measured in fewer"):
         calibration.images(*places[few].T, image[few], point[few], once)
@@ -161,11 +168,11 @@ def test_images_that_do_not_determine_their_stations_are_named():
     """A plane field of targets seen straight from above, without tilts: the distance
     and the focal length can change together."""
     rng = np.random.default_rng(5)
-    points = np.column_stack([rng.uniform(-3, 3, (14, 2)), np.zeros(14)])
-    above = [np.array([0, 0, 0.3 * k, x, 0.0, 9.0]) for k, x in enumerate((-1, 0, 1))]
-    places = np.concatenate([900 * rays(one, points) + [512, 384] for one in above])
+    points = np.column_stack([rng.uniform(-3, 3, (FEW, 2)), np.zeros(FEW)])
+    _, image, point, _ = photos(rng, points)
+    above = np.array([[0, 0, 0.3 * k, k - 1.5, 0, 9] for k in range(4)])
+    places = 900 * rays_of(above, points, image, point) + [512, 384]
     places = places + rng.normal(0, SIGMA, places.shape)
-    image, point = np.repeat(np.arange(3), 14), np.tile(np.arange(14), 3)
     found = calibration.calibrate_together(
         calibration.images(*places.T, image, point, points, sigma=SIGMA)
     )

@@ -5,72 +5,65 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles_calibration import gauss_newton, rays, scene
+import simulated_image
+from oracles_calibration import gauss_newton, rays
 from scipy import stats
+from simulated_image import AT, LENS, ONE, SIGMA, STRIPS, TWO, image, three_strips
 
 from jaxro import calibration
 from jaxro.adjustment.critical_values import chi_squared_p, fisher_p
 from jaxro.calibration import Model, Whole, rectangles, strips_along_x, zone_test
 
-SIGMA = 0.006
-AT = np.array([110.0, 70.0])
 
-
-def columns_and_rows(places):
-    """The four rectangles of `rectangles(2, 2)`."""
+def four_rectangles(places):
+    """The zones of `rectangles(2, 2)`."""
     low, high = places.min(0), places.max(0)
     right, below = ((places - low) / (high - low) >= 0.5).T
     return 2 * below + right
 
 
-def measured(seed, n=40, step=0.0):
-    """The unknowns of a photo, its object points, and its places; the focal length of
-    the first rectangle is longer by `step`."""
-    rng = np.random.default_rng(seed)
-    angles, station, points, places = scene(rng, n)
-    first = columns_and_rows(places) == 0
-    places = places * (1 + step / 60 * first)[:, None]
-    places = places + rng.normal(0, SIGMA, places.shape) + AT
-    return np.concatenate([angles, station, AT]), points, places
+def measured(seed, step=0.0, zones=four_rectangles):
+    """The truth of a photo, its object points, and its places; the focal length of the
+    first zone is longer by `step`."""
 
+    def longer(places):
+        return places * (1 + step / 60 * (zones(places) == 0))[:, None]
 
-def image(points, places):
-    return calibration.image(*places.T, points, sigma=SIGMA, y_down=True)
+    return simulated_image.measured(seed, distort=longer)
 
 
 def test_the_statistic_is_that_of_an_independent_solution():
-    pose, points, places = measured(3, step=0.05)
-    zone = columns_and_rows(places)
+    pose, points, places = measured(3, step=0.05, zones=three_strips)
+    zone = three_strips(places)
 
     def squares(of_zone, count):
         def residuals(x):
             seen = x[6:8] + x[8:][of_zone][:, None] * rays(x, points)
             return ((places - seen) / SIGMA).ravel()
 
-        x, _ = gauss_newton(residuals, np.concatenate([pose, np.full(count, 60.0)]))
-        return np.sum(residuals(x) ** 2)
+        begin = np.concatenate([pose, AT, np.full(count, 60.0)])
+        return np.sum(residuals(gauss_newton(residuals, begin)[0]) ** 2)
 
-    one, four = squares(0 * zone, 1), squares(zone, 4)
-    f = (one - four) / 3 / (four / (80 - 12))
-    found = zone_test.test_zones(image(points, places), Model(x=rectangles(2, 2)))
-    assert found.usable and (found.above, found.below) == (3, 68)
+    one, three = squares(0 * zone, 1), squares(zone, 3)
+    f = (one - three) / 2 / (three / (80 - 11))
+    found = zone_test.test_zones(image(points, places), STRIPS)
+    assert found.usable and (found.above, found.below) == (2, 69)
     np.testing.assert_allclose(found.f, f, rtol=1e-6)
-    np.testing.assert_allclose(found.probability, stats.f.sf(f, 3, 68), rtol=1e-6)
+    np.testing.assert_allclose(found.probability, stats.f.sf(f, 2, 69), rtol=1e-6)
     assert found.probability < 1e-3
 
 
 def test_what_cannot_be_tested_is_refused_or_named():
     _, points, places = measured(3)
     whole = image(points, places)
-    with pytest.raises(ValueError, match="one zone only"):
-        zone_test.test_zones(whole, Model(y=Whole()))
+    for single in (ONE, TWO, LENS):
+        with pytest.raises(ValueError, match="one zone only"):
+            zone_test.test_zones(whole, single)
     known = calibration.known(focal=60.0, focal_sigma=0.1)
     with pytest.raises(ValueError, match="a focal length is known"):
-        zone_test.test_zones(whole, Model(x=rectangles(2, 2)), known)
-    few = calibration.image(
-        *places.T, points, sigma=SIGMA, mask=np.arange(40) < 5, y_down=True
-    )
-    found = zone_test.test_zones(few, Model(x=rectangles(2, 2)))
+        zone_test.test_zones(whole, STRIPS, known)
+    few = image(points, places, mask=np.arange(40) < 5)
+    found = zone_test.test_zones(few, STRIPS)
     assert not found.usable and np.isnan(found.probability)
 
 

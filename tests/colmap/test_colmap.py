@@ -7,13 +7,12 @@ import sqlite3
 import sys
 from contextlib import closing
 
+import command_line
 import jax
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import jaxro
-from jaxro.cli import app
 from jaxro.geometry import mock_pairs
 from jaxro.rejection import OUTCOMES, Recommended
 from jaxro.rejection.classification import Kind
@@ -29,15 +28,13 @@ Config = pycolmap.TwoViewGeometryConfiguration
 NOISE = 0.5
 """Pixels."""
 
+LONGEST = 200
+"""Matches of the longest pair of each database made here. Pairs of a database are padded
+to one size, for which a program is compiled, so that all these share theirs."""
+
 
 def run(*arguments):
-    result = CliRunner().invoke(
-        app, ["colmap", *map(str, arguments)], env={"COLUMNS": "200"}
-    )
-    assert result.exception is None or isinstance(result.exception, SystemExit), (
-        result.exception
-    )
-    return result
+    return command_line.run("colmap", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -299,10 +296,12 @@ def test_every_pair_gets_what_it_is_worth(tmp_path):
         }
         turned = [add(cloud, small, 0 * base, wrong=0.2) for _ in range(8)]
         walls = [add(plane, small, base) for _ in range(4)]
+        more = rng.uniform([-2, -2, 4], [2, 2, 9], (LONGEST, 3))
+        pairs["longest"] = add(more, turn, base)
     result = run(path, "--sigma", NOISE)
     assert (
         result.exit_code == 1
-        and "19 pairs" in result.stdout
+        and "20 pairs" in result.stdout
         and "DEGENERATE" in result.stdout
     )
     with pycolmap.Database.open(str(path)) as database:
@@ -326,6 +325,7 @@ def test_every_pair_gets_what_it_is_worth(tmp_path):
         "few": Config.DEGENERATE,
         "none": Config.DEGENERATE,
         "ten": Config.CALIBRATED,
+        "longest": Config.CALIBRATED,
     }
     sizes = {name: len(g.inlier_matches) for name, g in found.items()}
     assert sizes["chance"] == sizes["few"] == sizes["none"] == 0 and sizes["ten"] == 12
@@ -379,7 +379,7 @@ def test_poses_and_matches_are_those_of_recommended(tmp_path):
                 has_prior_focal_length=True,
             )
         )
-        for k, count in enumerate([200, 60, *rng.integers(60, 201, 10).tolist()]):
+        for k, count in enumerate([LONGEST, 60, *rng.integers(60, 201, 10).tolist()]):
             sides = []
             for x, y in (photos[:2, k, :count], photos[2:, k, :count]):
                 image = pycolmap.Image(name=f"{k}_{len(sides)}.png", camera_id=camera)
@@ -448,7 +448,7 @@ def test_matches_that_repeat_others_are_no_evidence(tmp_path):
     repeats are kept with what they repeat. A geometry of a pair without matches is
     left, and told; images without keypoints harm nobody."""
     rng, path = np.random.default_rng(4), tmp_path / "repeats.db"
-    cloud = rng.uniform([-2, -2, 4], [2, 2, 9], (60, 3))
+    cloud = rng.uniform([-2, -2, 4], [2, 2, 9], (150, 3))
     with pycolmap.Database.open(str(path)) as database:
         camera = pycolmap.Camera(
             model="SIMPLE_PINHOLE",
@@ -463,7 +463,7 @@ def test_matches_that_repeat_others_are_no_evidence(tmp_path):
         )
         five, sound, _ = add(np.tile(cloud[:5], (12, 1))), add(cloud), add(cloud[:0])
         rows = (
-            np.concatenate([np.arange(60), np.arange(20)])[:, None]
+            np.concatenate([np.arange(150), np.arange(LONGEST - 150)])[:, None]
             .repeat(2, axis=1)
             .astype(np.uint32)
         )
@@ -475,7 +475,7 @@ def test_matches_that_repeat_others_are_no_evidence(tmp_path):
     assert "1 geometries of pairs without a row in matches" in result.stdout
     with pycolmap.Database.open(str(path)) as database:
         assert len(database.read_two_view_geometry(*five).inlier_matches) == 0
-        assert len(database.read_two_view_geometry(*sound).inlier_matches) == 80
+        assert len(database.read_two_view_geometry(*sound).inlier_matches) == LONGEST
 
 
 def change(statement, *values):

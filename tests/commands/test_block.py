@@ -8,7 +8,7 @@ from bad_tables import write
 from command_line import rows, run, words
 
 from jaxro.block import Flight, mock_block
-from jaxro.tables.examples import block as example
+from jaxro.tables.examples import block as block_example
 
 AXES = ("X", "Y", "Z")
 FILES = ("photos", "points", "control", "residuals")
@@ -22,7 +22,7 @@ def numbers(table, *columns):
 @pytest.fixture(scope="module")
 def made():
     """A simulated strip as `jaxro block` makes it."""
-    return example.simulate(models=4, seed=3)
+    return block_example.simulate(models=4, seed=3)
 
 
 @pytest.fixture
@@ -38,15 +38,25 @@ def block(tables, *more, sigma="0.005"):
     return run("block", tables[0], *control, "--focal", "153", *given, *more)
 
 
-def test_the_tables_of_a_simulated_block_give_its_numbers(tmp_path):
+@pytest.fixture(scope="module")
+def written(made, tmp_path_factory):
+    """The results of the tables as a user has them."""
+    folder = tmp_path_factory.mktemp("block")
+    texts = made.tables()
+    tables = tuple(write(folder, texts[name], name) for name in texts)
+    assert block(tables, "--out", folder / "out").exit_code == 0
+    return folder / "out"
+
+
+def test_the_tables_of_a_simulated_block_give_its_numbers(example, written, tables):
     """Names, orders and units survive; what is wrong is named."""
-    first, second = tmp_path / "first", tmp_path / "second"
-    told = run("block", "--models", "4", "--seed", "3", "--out", first)
+    told = example("block")
+    first, second = told.out, written
     assert told.exit_code == 0 and not told.stderr
     names = {f"{name}.csv" for name in (*FILES, *COVARIANCES, "pairs", "ground")}
     assert {p.name for p in first.iterdir()} == names | {"summary.json", "block.png"}
-    again = block((first / "pairs.csv", first / "ground.csv"), "--out", second)
-    assert again.exit_code == 0
+    for path in tables:
+        assert path.read_text() == (first / f"{path.stem}.csv").read_text()
     for name in (*FILES, *COVARIANCES):
         one, other = (rows(folder / f"{name}.csv") for folder in (first, second))
         assert [list(row) for row in one] == [list(row) for row in other]
@@ -65,9 +75,8 @@ def test_the_tables_of_a_simulated_block_give_its_numbers(tmp_path):
     assert summary["usable"] and summary["rays_left_out"] == 1
 
 
-def test_points_and_photos_are_true_within_their_deviations(made, tables, tmp_path):
-    out = tmp_path / "out"
-    assert block(tables, "--out", out).exit_code == 0
+def test_points_and_photos_are_true_within_their_deviations(written):
+    out = written
     truth = mock_block(3, Flight(models=4), control_every=2)
     at = dict(zip(truth.block.points, truth.points, strict=True))
     points = rows(out / "points.csv")
@@ -140,9 +149,9 @@ def test_without_control_the_network_is_free(tables):
     assert "inner constraints" in words(told.stdout)
 
 
-def test_a_control_point_on_one_photo_counts(tables, tmp_path):
+def test_a_control_point_on_one_photo_counts(tables, written, tmp_path):
     """By --rays; two more measurements, and three known coordinates."""
-    plain = json_of(tables, tmp_path / "plain")
+    plain = json.loads((written / "summary.json").read_text())
     rays = write(tmp_path, "photo,point,x,y\n1-3,new,10.0,5.0\n", "rays.csv")
     ground = tables[1].read_text() + "new,2000.0,80.0,30.0,50,50,50,control\n"
     tables[1].write_text(ground)
@@ -151,10 +160,10 @@ def test_a_control_point_on_one_photo_counts(tables, tmp_path):
     assert found["points"] == plain["points"] + 1
 
 
-def test_stations_inner_parameters_and_components(tables, tmp_path):
+def test_stations_inner_parameters_and_components(tables, written, tmp_path):
     """Stations are rows of the ground with this role; a wrong focal length is found."""
-    plain = json_of(tables, tmp_path / "plain")
-    photos = rows(tmp_path / "plain/photos.csv")
+    plain = json.loads((written / "summary.json").read_text())
+    photos = rows(written / "photos.csv")
     rng = np.random.default_rng(1)
     for row in photos:
         at = [float(row[a]) + rng.normal(0, 0.1) for a in AXES]
@@ -223,17 +232,16 @@ def json_of(tables, out, *more):
     return json.loads((out / "summary.json").read_text())
 
 
-def test_parquet_in_and_out(tables, tmp_path):
+def test_parquet_in_and_out(tables, written, tmp_path):
     import pyarrow.parquet as pq
 
     from jaxro.tables.conversion import convert
 
     target = tmp_path / "pairs.parquet"
     convert(tables[0], target)
-    json_of(tables, tmp_path / "csv")
     json_of((target, tables[1]), tmp_path / "parquet")
     for name in (*FILES, *COVARIANCES):
-        expected = rows(tmp_path / f"csv/{name}.csv")
+        expected = rows(written / f"{name}.csv")
         table = pq.read_table(tmp_path / f"parquet/{name}.parquet").to_pylist()
         assert [list(row) for row in table] == [list(row) for row in expected]
         first = [value for value in table[0].values() if isinstance(value, float)]

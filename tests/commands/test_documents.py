@@ -3,20 +3,18 @@ pose graphs; and what is refused before anything is written."""
 
 import json
 
+import examples
 import numpy as np
 import pytest
 from command_line import run, words
 
-COMMANDS = ("orient", "clean", "block", "heights")
 
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_json_is_the_summary_and_nothing_else(name, tmp_path):
-    out = tmp_path / "out"
-    told = run(name, "--json", "--out", out)
-    assert told.exit_code == 0
-    said = json.loads(told.stdout)
-    summary = json.loads((out / "summary.json").read_text())
+@pytest.mark.parametrize("name", examples.ARGUMENTS)
+def test_json_is_the_summary_and_nothing_else(name, example):
+    told = example(name)
+    assert told.json_code == 0
+    said = json.loads(told.json)
+    summary = json.loads((told.out / "summary.json").read_text())
     assert (said["orientation"] if name == "clean" else said) == summary
     assert said["program"].startswith("jaxro ")
 

@@ -10,18 +10,23 @@ import pytest
 from bad_tables import write
 from command_line import rows, run, words
 
-from jaxro.tables.examples import survey as example
+from jaxro.tables.examples import survey as survey_example
 
-CAMERAS = ["--camera-height", str(example.CAMERA_HEIGHT), "--base", str(example.BASE)]
+CAMERAS = [
+    "--camera-height",
+    str(survey_example.CAMERA_HEIGHT),
+    "--base",
+    str(survey_example.BASE),
+]
 
 
 @pytest.fixture
 def tables(tmp_path):
     """The example as a user's files."""
     return (
-        write(tmp_path, example.READINGS, "readings.csv"),
-        write(tmp_path, example.GRID, "grid.csv"),
-        write(tmp_path, example.TRAVERSES, "traverses.csv"),
+        write(tmp_path, survey_example.READINGS, "readings.csv"),
+        write(tmp_path, survey_example.GRID, "grid.csv"),
+        write(tmp_path, survey_example.TRAVERSES, "traverses.csv"),
     )
 
 
@@ -30,15 +35,12 @@ def survey(readings, grid, traverses=None, *options):
     return run("heights", readings, "--grid", grid, *legs, *CAMERAS, *options)
 
 
-def test_heights_of_the_example_are_true_within_their_deviations(
-    tables, tmp_path, monkeypatch
-):
-    """Written, read again, and held against the surface that was photographed; without
-    a file, by a program that is kept, it is the same."""
-    pytest.importorskip("matplotlib")
-    out = tmp_path / "out"
-    told = survey(*tables, "--out", out)
+def test_heights_of_the_example_are_true_within_their_deviations(example):
+    """Held against the surface that was photographed."""
+    told = example("heights")
     assert told.exit_code == 0 and not told.stderr
+    assert "simulated example" in told.stdout
+    out = told.out
     files = {"heights.csv", "traverses.csv", "legs.csv", "summary.json", "surface.png"}
     assert {path.name for path in out.iterdir()} == files
     assert (out / "surface.png").read_bytes().startswith(b"\x89PNG")
@@ -47,7 +49,7 @@ def test_heights_of_the_example_are_true_within_their_deviations(
         np.array([float(p[c]) for p in points])
         for c in ("height_mm", "sd_mm", "over_grid_mm", "sd_over_grid_mm")
     )
-    truth, free = np.array(example.TRUTH), sd > 0
+    truth, free = np.array(survey_example.TRUTH), sd > 0
     assert np.sum(~free) == 2 and all(
         p["from"] == "known" for p, f in zip(points, free, strict=True) if not f
     )
@@ -67,14 +69,20 @@ def test_heights_of_the_example_are_true_within_their_deviations(
     summary = json.loads((out / "summary.json").read_text(), parse_constant=pytest.fail)
     assert summary["degrees_of_freedom"] == 3 and summary["suspicious"] == []
     legs = rows(out / "legs.csv")
-    assert len(legs) == example.TRAVERSES.count("\n") - 1
+    assert len(legs) == survey_example.TRAVERSES.count("\n") - 1
+
+
+def test_tables_of_a_user_give_the_same(tables, tmp_path, example, monkeypatch):
+    """By a program that is kept."""
     monkeypatch.setenv("JAXRO_CACHE", str(tmp_path / "kept"))
-    known = run("heights")
+    read = survey(*tables)
     assert len(list((tmp_path / "kept").iterdir())) == 1
-    assert known.exit_code == 0 and words(told.stdout).split(" Written to ")[0].split(
-        "H 1505"
-    )[1] in words(known.stdout)
-    assert "simulated example" in known.stdout
+    assert read.exit_code == 0
+    figures = [
+        words(told.stdout).split(" Written to ")[0].split("H 1505")[1]
+        for told in (read, example("heights"))
+    ]
+    assert figures[0] and figures[1].startswith(figures[0])
 
 
 def test_a_wrong_leg_is_named(tables, tmp_path):
@@ -82,9 +90,9 @@ def test_a_wrong_leg_is_named(tables, tmp_path):
     text = re.sub(
         r"(?m)^middle,s7,s8,([\d.]+),([\d.]+)$",
         lambda m: f"middle,s7,s8,{m[1]},{float(m[2]) + 0.08:.3f}",
-        example.TRAVERSES,
+        survey_example.TRAVERSES,
     )
-    assert text != example.TRAVERSES
+    assert text != survey_example.TRAVERSES
     wrong = write(tmp_path, text, "wrong.csv")
     told = survey(tables[0], tables[1], wrong, "--out", tmp_path / "out")
     said = words(told.output)
@@ -102,13 +110,13 @@ def test_without_traverses_heights_are_read_from_known_points_or_the_grid(
 ):
     """A reading of the grid for each square stands for those at the points; no places,
     no picture."""
-    lines = [line.split(",") for line in example.READINGS.split()]
+    lines = [line.split(",") for line in survey_example.READINGS.split()]
     readings = write(
         tmp_path,
         "\n".join(",".join([*line[:3], line[6]]) for line in lines),
         "short.csv",
     )
-    grid = example.GRID.split()
+    grid = survey_example.GRID.split()
     first = {line[1]: line[3] for line in reversed(lines[1:])}
     squares = [
         f"{grid[0]},parallax",
@@ -147,7 +155,7 @@ def test_a_traverse_may_hang_on_corners_of_the_grid(tables, tmp_path):
         "t,s1,s2,54.021,53.903",
         "t,s2,A2,53.903,55.485",
     ]
-    unknown = re.sub(r"-\d+\.\d$", "", example.READINGS, flags=re.M)
+    unknown = re.sub(r"-\d+\.\d$", "", survey_example.READINGS, flags=re.M)
     told = survey(
         write(tmp_path, unknown, "r.csv"),
         tables[1],
@@ -158,7 +166,7 @@ def test_a_traverse_may_hang_on_corners_of_the_grid(tables, tmp_path):
     )
     assert (
         told.exit_code == 0
-        and abs(float(found[1]) - example.TRUTH[0]) < 3 * float(found[2]) < 6
+        and abs(float(found[1]) - survey_example.TRUTH[0]) < 3 * float(found[2]) < 6
     )
     assert "Traverse t, 3 legs, closes with" in told.stdout
 
@@ -253,7 +261,9 @@ def test_bad_tables_say_where_and_write_nothing(case, tables, tmp_path):
 
 def test_traverses_without_a_known_height_and_options_that_do_not_fit(tables, tmp_path):
     loose = write(
-        tmp_path, re.sub(r"-\d+\.\d$", "", example.READINGS, flags=re.M), "loose.csv"
+        tmp_path,
+        re.sub(r"-\d+\.\d$", "", survey_example.READINGS, flags=re.M),
+        "loose.csv",
     )
     told = survey(loose, *tables[1:])
     assert told.exit_code == 2 and "no legs join to a known height" in told.stderr
@@ -262,7 +272,7 @@ def test_traverses_without_a_known_height_and_options_that_do_not_fit(tables, tm
         re.sub(
             r"(\d\.\d{3})$",
             lambda m: f"{float(m[1]) * 1000:g}",
-            example.GRID,
+            survey_example.GRID,
             flags=re.M,
         ),
         "m.csv",
@@ -295,10 +305,10 @@ def test_traverses_without_a_known_height_and_options_that_do_not_fit(tables, tm
         )
 
 
-def test_a_known_height_that_is_not_what_is_read_there_is_told(tables, tmp_path):
+def test_a_known_height_that_is_not_what_is_read_is_told(tables, tmp_path, example):
     """Given 12 mm too high, and read with ± 1.1 mm."""
     moved = write(
-        tmp_path, example.READINGS.replace("57,-127.6", "57,-115.6"), "moved.csv"
+        tmp_path, survey_example.READINGS.replace("57,-127.6", "57,-115.6"), "moved.csv"
     )
     told = survey(moved, *tables[1:])
     assert (
@@ -306,17 +316,17 @@ def test_a_known_height_that_is_not_what_is_read_there_is_told(tables, tmp_path)
         and "The height of s1 is given as -115.6 mm, and read as -127."
         in words(told.stdout)
     )
-    assert "The height of" not in words(survey(*tables).stdout)
+    assert "The height of" not in words(example("heights").stdout)
 
 
-def test_heights_from_another_zero(tables, tmp_path):
+def test_heights_from_another_zero(tables, tmp_path, example):
     """Grid, known heights and cameras 250 m higher: heights 250 m higher, to the
     rounding of their numbers."""
     lift = lambda text: re.sub(
         r"(?m)(-[\d.]+)$", lambda m: f"{250_000 + float(m[1]):.1f}", text
     )
-    readings = write(tmp_path, lift(example.READINGS), "high.csv")
-    grid = re.sub(r"(?m)$", ",250000", example.GRID.strip()).replace(
+    readings = write(tmp_path, lift(survey_example.READINGS), "high.csv")
+    grid = re.sub(r"(?m)$", ",250000", survey_example.GRID.strip()).replace(
         "photo_side,250000", "photo_side,height"
     )
     high = write(tmp_path, grid + "\n", "high_grid.csv")
@@ -333,8 +343,10 @@ def test_heights_from_another_zero(tables, tmp_path):
         ).exit_code
         == 0
     )
-    assert survey(*tables, "--out", tmp_path / "low").exit_code == 0
-    one, other = (rows(tmp_path / name / "heights.csv") for name in ("high", "low"))
+    one, other = (
+        rows(folder / "heights.csv")
+        for folder in (tmp_path / "high", example("heights").out)
+    )
     for column, zero in (
         ("height_mm", 250_000),
         ("sd_mm", 0),
@@ -423,3 +435,9 @@ def test_the_table_of_1982_is_reproduced():
         and "misprint for 0.069" in told
     )
     assert "(20) H² / x B, n = 9 5386 5500" in told
+
+
+def test_the_table_of_1982_has_room_on_a_narrow_terminal():
+    told = run("reproduce", "gutkin1982", columns=80)
+    assert told.exit_code == 0 and "\u2026" not in told.output
+    assert max(map(len, told.output.splitlines())) <= 80

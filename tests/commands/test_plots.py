@@ -8,7 +8,10 @@ import pytest
 from command_line import run
 
 import jaxro
-from jaxro.commands import plots as pictures
+from jaxro.commands import orient as jobs, plots as pictures
+from jaxro.commands.clean import SIMULATED
+from jaxro.commands.documents import Documents
+from jaxro.commands.request import Options
 from jaxro.experiments.compare import Comparison, Estimate, Score, Setting
 from jaxro.reports import pair_plots
 from jaxro.reports.columns import RESULT_NAMES
@@ -62,69 +65,53 @@ def table_of_pairs(folder: Path, number: int) -> Path:
     return file
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """The results that a command shows, and the models that it draws."""
-    from jaxro.commands import orient as jobs
-
-    seen = {"models": []}
-    draw = jaxro.plots.draw_model_errors
-
-    def keep(model, covariances, **more):
-        seen["models"].append((model, covariances))
-        return draw(model, covariances, **more)
-
-    monkeypatch.setattr(jaxro.plots, "draw_model_errors", keep)
-    tell = lambda console, job, results: seen.update(results=results)
-    monkeypatch.setattr(jobs, "show", tell)
-    return seen
-
-
-def check_model(drawn, system, base):
+def check_model(monkeypatch, options, procedure=None):
     """Model and covariances of the first pair, which are read from the columns of a
     report, are those of the orientation."""
-    one = pair_plots.One(drawn["results"], 0)
-    _, pair, _ = pair_plots.measured(one)
-    orientation = jaxro.orient(pair, elements=system, base=base)
+    pictures_wanted = Documents(plots=Path("pictures"))
+    options = replace(options, documents=pictures_wanted)
+    job = jobs.prepare(options, SIMULATED, procedure)
+    results, verdicts = jobs.solve_table(job, lambda done: None)
+    one, seen = pair_plots.One(results, 0), []
+    keep = lambda model, covariances, **more: seen.append((model, covariances))
+    monkeypatch.setattr(jaxro.plots, "draw_model_errors", keep)
+    pair_plots.draw_model(one)
+    ((shown, covariances),) = seen
+    _, pair, _ = pair_plots.measured(one, verdicts)
+    kept = np.asarray(pair.mask)
+    orientation = jaxro.orient(pair, elements=results.system, base=options.base)
     model = np.stack([np.asarray(c) for c in orientation.model], axis=-1)
     expected = jaxro.plots.model_covariances(pair, orientation)
-    shown, covariances = drawn["models"][0]
-    np.testing.assert_allclose(shown, model, atol=1e-8)
-    np.testing.assert_allclose(covariances, expected, rtol=1e-6)
+    np.testing.assert_allclose(shown, model[kept], atol=1e-8)
+    np.testing.assert_allclose(covariances, expected[kept], rtol=1e-6)
+    return kept
 
 
-def test_a_cleaned_pair_has_all_pictures(tmp_path, drawn):
-    """The wrong point takes no part in the model; a given base is its scale."""
-    told = run(
-        *("clean", "--elements", "independent", "--base", "65"),
-        *("--plots", tmp_path / "out"),
-    )
+def test_a_cleaned_pair_has_all_pictures(example):
+    told = example("clean")
     assert told.exit_code == 0
-    made = {path.stem: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    made = {path.stem: path.read_bytes() for path in told.plots.iterdir()}
     assert set(made) == OF_A_PAIR
     assert {content[:4] for content in made.values()} == {b"\x89PNG"}
-    check_model(drawn, jaxro.IndependentElements, 65.0)
+
+
+def test_the_wrong_point_takes_no_part_in_the_model(monkeypatch):
+    """And a given base is its scale."""
+    options = Options(elements="independent", base=65.0)
+    kept = check_model(monkeypatch, options, jaxro.rejection.Dorozhinsky())
+    assert np.flatnonzero(~kept).tolist() == [6]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "system", "base"),
-    [
-        ("relative", jaxro.RelativePose, None),
-        ("dependent", jaxro.DependentElements, 65.0),
-    ],
+    ("name", "base"), [("relative", None), ("dependent", 65.0)], ids=str
 )
 def test_a_given_sigma_changes_no_accuracy_a_posteriori(
-    tmp_path, drawn, name, system, base
+    tmp_path, monkeypatch, name, base
 ):
     file = table_of_pairs(tmp_path, 2)
-    given = () if base is None else ("--base", str(base))
-    told = run(
-        *("orient", file, "--focal", "70", "--elements", name, *given),
-        *("--sigma", "0.02", "--plots", tmp_path / "out"),
-    )
-    assert told.exit_code == 1  # the last pair has four points
-    check_model(drawn, system, base)
+    more = {"focal": 70.0, "sigma": "0.02", "base": base}
+    check_model(monkeypatch, Options(file=file, elements=name, **more))
 
 
 @pytest.mark.slow

@@ -1,14 +1,15 @@
 """CSV and Parquet tables of the same pairs go the same way: the figures are the same to
-the last digit, for one pair, a few, and many."""
+the last digit, for one pair, a few, and many, which are worked on in parts."""
 
 import csv
 import math
+from functools import partial
 
+import command_line
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from jaxro.cli import app
+from jaxro.commands import large
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -17,6 +18,15 @@ FOCAL = 100.0
 COUNTS = {"one": 1, "few": 3, "many": 70}
 TABLES = ("elements", "residuals", "points", "reliability")
 TEXTS = {"pair", "point", "result"}
+PART_ROWS = 200
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_parts():
+    """Many pairs make four parts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(large, "Large", partial(large.Large, part_rows=PART_ROWS))
+        yield
 
 
 def measure(pairs: int) -> dict[str, list]:
@@ -60,16 +70,20 @@ def folder(request, tmp_path_factory):
 
 
 def run(command, folder, *more):
-    """The exit codes of both tables."""
+    """The exit codes of both tables, and of CSV with Parquet results."""
     codes = []
-    for kind in ("csv", "parquet"):
-        options = ("--focal", FOCAL, "--out", folder / f"{command}_{kind}", *more)
-        if kind == "parquet":
-            options = (*options, "--tables", ",".join(TABLES))
-        arguments = (command, folder / f"table.{kind}", *options)
-        result = CliRunner().invoke(app, [*map(str, arguments)])
-        assert result.exit_code in (0, 1), result.output
-        codes.append(result.exit_code)
+    parquet = ("--tables", ",".join(TABLES))
+    for kind, results in (("csv", ()), ("parquet", parquet), ("csv", parquet)):
+        name = f"{command}_{kind}" + (
+            "_as_parquet" if kind == "csv" and results else ""
+        )
+        table = folder / f"table.{kind}"
+        given = ("--focal", FOCAL, "--out", folder / name, *results, *more)
+        if results:
+            given = (*given, "--parquet")
+        told = command_line.run(command, table, *given)
+        assert told.exit_code in (0, 1), told.output
+        codes.append(told.exit_code)
     return codes
 
 
@@ -81,6 +95,11 @@ def assert_same(folder, command, table, without=()):
     assert len(rows) == found.num_rows
     shared = set(found.column_names) & set(rows[0]) - set(without)
     assert set(found.column_names) - shared <= {"used", "outcome", "kept", "undecided"}
+    if "kept" in found.column_names:
+        kept = [row["verdict"] == "kept" for row in rows]
+        assert found.column("kept").to_pylist() == kept
+    converted = pq.read_table(folder / f"{command}_csv_as_parquet" / table)
+    assert converted.equals(found)
     for name in shared:
         texts = [row[name] for row in rows]
         for text, value in zip(texts, found.column(name).to_pylist(), strict=True):
@@ -95,14 +114,41 @@ def assert_same(folder, command, table, without=()):
 
 
 def test_oriented_pairs_have_the_same_figures(folder):
-    first, second = run("orient", folder)
-    assert first == second
+    assert len(set(run("orient", folder))) == 1
     for table in TABLES:
         assert_same(folder, "orient", table)
+    parts = len(list((folder / "orient_parquet" / "elements").iterdir()))
+    assert (parts > 3) == (folder.name.startswith("many"))
 
 
 def test_cleaned_pairs_have_the_same_figures(folder):
-    first, second = run("clean", folder, "--procedure", "three-sigma")
-    assert first == second
+    """Every row stays, with its verdict."""
+    assert len(set(run("clean", folder, "--procedure", "three-sigma"))) == 1
     for table in (*TABLES, "cleaned"):
         assert_same(folder, "clean", table)
+    measured = pq.read_table(folder / "table.parquet")
+    cleaned = pq.read_table(folder / "clean_parquet" / "cleaned")
+    assert cleaned.select(measured.column_names).equals(measured)
+    kept = np.sum(cleaned.column("kept").to_pylist())
+    assert pq.read_table(folder / "clean_parquet" / "residuals").num_rows == kept
+
+
+def test_what_holds_no_number_is_no_point_that_was_rejected(tmp_path):
+    """And harms no other pair."""
+    columns, found = measure(3), {}
+    row = columns["pair"].index("p001")
+    for name in ("whole", "lost"):
+        if name == "lost":
+            columns["x_left"][row] = None
+        table, out = tmp_path / f"{name}.parquet", tmp_path / name
+        pq.write_table(pa.table(columns), table)
+        asked = "--focal", FOCAL, "--procedure", "three-sigma", "--out", out
+        asked += ("--tables", ",".join(TABLES))  # the program of the tests above
+        code = command_line.run("clean", table, *asked).exit_code
+        assert code == 1 if name == "lost" else code in (0, 1)
+        found[name] = pq.read_table(out / "elements").to_pylist()
+    assert found["lost"][1]["result"] == "non_finite_input"
+    for k in (0, 2):
+        assert found["lost"][k] == found["whole"][k]
+    lost = pq.read_table(tmp_path / "lost" / "cleaned").slice(row, 1).to_pylist()[0]
+    assert (lost["kept"], lost["order"], lost["statistic"]) == (False, 0, np.inf)

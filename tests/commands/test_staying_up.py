@@ -6,25 +6,31 @@ import os
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
+import command_line
 import pytest
+import typer
 from filelock import FileLock
-from typer.testing import CliRunner
 
-from jaxro.cli import app
 from jaxro.commands import large, orient
-from jaxro.commands.ending import NOT_SHOWN
+from jaxro.commands.ending import NOT_SHOWN, end
 from jaxro.commands.journal import JOURNAL
 from jaxro.commands.request import Options
 from jaxro.commands.stream import CONVERTED
 from jaxro.reports.columns import TABLES
-from jaxro.reports.terminal import Spent, say_compiling, stopwatch
+from jaxro.reports.terminal import (
+    Spent,
+    say_compiling,
+    steady_streams,
+    stopwatch,
+)
 from jaxro.tables import whole
-from jaxro.tables.examples import pair as example
+from jaxro.tables.examples import pair as pair_example
 from jaxro.tables.fields import TableError
 
-FOCAL = ["--focal", str(example.FOCAL)]
+FOCAL = ["--focal", str(pair_example.FOCAL)]
 COMMAND = [sys.executable, "-m", "jaxro"]
 FILES = {f"{name}.csv" for name in TABLES} | {"summary.json"}
 
@@ -33,30 +39,82 @@ FILES = {f"{name}.csv" for name in TABLES} | {"summary.json"}
 def table(tmp_path):
     path = tmp_path / "in" / "pair.csv"
     path.parent.mkdir()
-    path.write_text(example.TABLE)
+    path.write_text(pair_example.TABLE)
     return path
 
 
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """Of processes that share their programs, so that they are compiled once. What JAX
+    keeps itself cannot be kept a second time."""
+    kept = str(tmp_path_factory.mktemp("kept"))
+    return os.environ | {"JAXRO_CACHE": kept, "JAX_COMPILATION_CACHE_DIR": ""}
+
+
 def run(*arguments):
-    return CliRunner().invoke(
-        app, ["orient", *map(str, arguments)], env={"COLUMNS": "200"}
-    )
+    return command_line.run("orient", *arguments)
 
 
 def names(folder: Path) -> set[str]:
     return {entry.name for entry in folder.iterdir()}
 
 
+def pipe_without_a_reader():
+    reader, writer = os.pipe()
+    os.close(reader)
+    return os.fdopen(writer, "w")
+
+
 @pytest.mark.parametrize(
     ("stream", "code"),
-    [("> /dev/full", NOT_SHOWN), ("| true", 0), (">&-", 0), (">&- 2>&-", 0)],
+    [
+        (lambda: os.fdopen(os.open("/dev/full", os.O_WRONLY), "w"), NOT_SHOWN),
+        (pipe_without_a_reader, 0),
+        (lambda: None, 0),
+    ],
+    ids=["full disk", "pipe without a reader", "none"],
 )
-def test_a_broken_standard_output_costs_no_results(stream, code, table, tmp_path):
+def test_the_exit_code_where_standard_output_is_refused(
+    stream, code, monkeypatch, capfd
+):
+    """Who reads may stop at any time, and there may be nobody; but a report that is
+    lost on a full disk is told."""
+    done = []
+
+    def work():
+        print("a report")
+        done.append("all of it")
+        return True
+
+    refused = stream()
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", refused)
+        with pytest.raises(typer.Exit) as ended:
+            end(work)
+    with suppress(OSError, AttributeError):
+        refused.close()
+    assert ended.value.exit_code == code and done
+    assert ("files of --out are written" in capfd.readouterr().err) == bool(code)
+
+
+@pytest.mark.parametrize(
+    ("stream", "code"),
+    [
+        ("> /dev/full", NOT_SHOWN),
+        *(
+            pytest.param(stream, 0, marks=pytest.mark.slow)
+            for stream in ("| true", ">&-", ">&- 2>&-")
+        ),
+    ],
+)
+def test_a_broken_standard_output_costs_no_results(
+    stream, code, table, tmp_path, environment
+):
     out = tmp_path / "out"
-    line = f'"{sys.executable}" -m jaxro orient {table} --focal {example.FOCAL}'
+    line = f'"{sys.executable}" -m jaxro orient {table} --focal {pair_example.FOCAL}'
     # pipefail: the exit code of jaxro, not that of who reads it
     shell = ["bash", "-c", f"set -o pipefail; {line} --out {out} {stream}"]
-    done = subprocess.run(shell, capture_output=True, text=True)
+    done = subprocess.run(shell, env=environment, capture_output=True, text=True)
     assert done.returncode == code
     assert names(out) == FILES
     assert "Traceback" not in done.stderr and "Exception" not in done.stderr
@@ -64,17 +122,25 @@ def test_a_broken_standard_output_costs_no_results(stream, code, table, tmp_path
         assert "files of --out are written" in done.stderr
 
 
-def test_letters_that_a_terminal_has_not_got_are_written_in_others(table):
-    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
-    arguments = [*COMMAND, "orient", table, *FOCAL, "--elements", "dependent"]
-    done = subprocess.run(arguments, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0
-    assert "+- sd" in done.stdout and "?" not in done.stdout
+def test_letters_that_a_terminal_has_not_got_are_written_in_others(
+    example, tmp_path, monkeypatch
+):
+    lines = example("orient").stdout.splitlines()
+    report = "\n".join(line for line in lines if not set("─━") & set(line))
+    assert "± sd" in report
+    with (tmp_path / "shown").open("w", encoding="ascii") as terminal:
+        monkeypatch.setattr(sys, "stdout", terminal)
+        with steady_streams() as flush:
+            print(report)
+            assert flush() is None
+        monkeypatch.undo()
+    shown = (tmp_path / "shown").read_text()
+    assert "+- sd" in shown and "?" not in shown
 
 
 def test_control_characters_of_names_are_not_shown(tmp_path):
     path = tmp_path / "names.csv"
-    lines = example.TABLE.splitlines()
+    lines = pair_example.TABLE.splitlines()
     column = lines[0].split(",").index("point")
     fields = lines[1].split(",")
     fields[column] = "evil\x1b]0;title\x07\u202ename"
@@ -110,10 +176,11 @@ def test_two_processes_do_not_write_into_one_folder(table, tmp_path):
     assert names(out.parent) == {"out", neighbour.name}
 
 
-def test_two_processes_at_once(table, tmp_path):
+def test_two_processes_at_once(table, tmp_path, environment):
     out = tmp_path / "out"
     line = [*COMMAND, "orient", table, *FOCAL, "--out", out]
-    both = [subprocess.Popen(line, stderr=subprocess.DEVNULL) for _ in range(2)]
+    quiet = {"env": environment, "stderr": subprocess.DEVNULL}
+    both = [subprocess.Popen(line, **quiet) for _ in range(2)]
     assert sorted(process.wait() for process in both) == [0, 2]
     assert names(out) == FILES and names(tmp_path) == {"in", "out"}
 
@@ -133,7 +200,7 @@ def test_input_that_changes_meanwhile_is_noticed(parquet, table, tmp_path, monke
     before = getattr(place, name)
 
     def change(*arguments):
-        table.write_text(example.TABLE + "\n")
+        table.write_text(pair_example.TABLE + "\n")
         return before(*arguments)
 
     monkeypatch.setattr(place, name, change)
@@ -148,15 +215,17 @@ def test_damaged_parts_are_made_anew(tmp_path, monkeypatch):
     """Whatever byte of a finished part, of the journal, or of the converted table that
     a part is made anew from, is another one: the results are the same."""
     pytest.importorskip("pyarrow")
-    header, *points = example.TABLE.splitlines()
+    header, *points = pair_example.TABLE.splitlines()
     source = tmp_path / "pairs.csv"
     rows = [f"p{k},{line}" for k in range(4) for line in points]
     source.write_text("\n".join([f"pair,{header}", *rows]))
-    options = Options(file=source, focal=example.FOCAL, out=tmp_path / "out")
+    options = Options(file=source, focal=pair_example.FOCAL, out=tmp_path / "out")
 
     def work(resume, out):
         wanted = large.Large(resume=resume, part_rows=len(points), tables="elements")
-        return large.run(Options(file=source, focal=example.FOCAL, out=out), wanted)
+        return large.run(
+            Options(file=source, focal=pair_example.FOCAL, out=out), wanted
+        )
 
     assert work(False, tmp_path / "whole")
     expected = {
@@ -249,7 +318,7 @@ def test_a_fork_after_the_first_call_is_told(tmp_path):
 
 def test_semicolons_and_decimal_commas(table, tmp_path):
     spread = tmp_path / "spread.csv"
-    header, *points = example.TABLE.strip().splitlines()
+    header, *points = pair_example.TABLE.strip().splitlines()
     lines = [header.replace(",", ";")]
     lines += [line.replace(",", ";").replace(".", ",") for line in points]
     spread.write_text("\n".join(lines))

@@ -12,40 +12,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import run
 
-from jaxro.cli import app
 from jaxro.commands import large
 from jaxro.commands.journal import JOURNAL, here
 from jaxro.commands.request import Options
 from jaxro.tables.fields import TableError
-from jaxro.xla import settings
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 FOCAL = 100.0
-PARTS = 12
 RENAME = os.replace
 
 
-def run(command, *arguments):
-    result = CliRunner().invoke(
-        app, [command, *map(str, arguments)], env={"COLUMNS": "200"}
-    )
-    assert result.exception is None or isinstance(result.exception, SystemExit), (
-        result.exception
-    )
-    return result
+QUICK = """
+from jaxro.xla import settings
 
+def quick():  # compile as the tests do, to end in the same bytes
+    settings.COMPILE_FAST.update(settings.COMPILE_FASTEST)
 
-@pytest.fixture(scope="module", autouse=True)
-def settings_of_users():
-    """Other processes compile as users do: so does this one, to end in the same
-    bytes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(settings.COMPILE_FAST, "xla_backend_optimization_level", 1)
-        yield
+quick()
+"""
+"""What a process that is compared with this one does first."""
 
 
 @pytest.fixture(scope="module")
@@ -122,73 +111,30 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_the_numbers_of_the_csv_files(folder, whole):
-    plain = run(
-        "orient", folder / "table.csv", "--focal", FOCAL, "--out", folder / "plain"
-    )
-    assert plain.exit_code == 0
-    assert len(list((whole / "elements").iterdir())) >= PARTS
-    for name, keys in (
-        ("elements", ["pair"]),
-        ("residuals", ["pair", "point"]),
-        ("points", ["pair", "point"]),
-    ):
-        table = pq.read_table(whole / name).to_pylist()
-        with (folder / "plain" / f"{name}.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        assert [[r[k] for k in keys] for r in table] == [
-            [r[k] for k in keys] for r in rows
-        ]
-        for column in set(rows[0]) - {
-            "pair",
-            "point",
-            "result",
-            "advice",
-            "iterations",
-            "in_front",
-        }:
-            values = [float(r[column]) for r in rows]
-            np.testing.assert_allclose(
-                [r[column] for r in table], values, rtol=1e-8, atol=1e-9, err_msg=column
-            )
+def test_every_pair_is_in_one_of_many_parts(whole):
+    """What is in them is compared in test_same_figures.py."""
+    assert len(list((whole / "elements").iterdir())) >= 12
+    assert pq.read_table(whole / "elements").num_rows == 240
     summary = json.loads((whole / "summary.json").read_text())
     assert (summary["pairs"], summary["results"]) == (240, {"successful": 240})
 
 
-def test_csv_gives_the_same_tables(folder, whole):
-    found = run(
-        "orient",
-        folder / "table.csv",
-        "--focal",
-        FOCAL,
-        "--parquet",
-        "--out",
-        folder / "from_csv",
-    )
-    assert found.exit_code == 0
-    for name in ("elements", "residuals", "points"):
-        one, other = (
-            pq.read_table(place / name) for place in (whole, folder / "from_csv")
-        )
-        assert one.column_names == other.column_names and one.num_rows == other.num_rows
-        for column in one.column_names:
-            a, b = one.column(column), other.column(column)
-            if pa.types.is_floating(a.type):
-                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
-            else:
-                assert a.to_pylist() == b.to_pylist()
+STOPPED = f"""{QUICK}
+import sys
+from pathlib import Path
+from jaxro.commands import large
+from jaxro.commands.request import Options
+
+source, out = map(Path, sys.argv[1:])
+wanted = large.Large(part_rows=200, tables="elements,residuals,points,reliability")
+large.run(Options(file=source, focal={FOCAL}, out=out), wanted)
+"""
 
 
 def stopped(folder: Path, out: Path, parts: int) -> None:
     """A run in a process of its own, killed when its journal has so many parts."""
-    script = (
-        "import sys, pathlib; from jaxro.commands import large; from "
-        "jaxro.commands.request import Options; p = pathlib.Path;"
-        f"large.run(Options(file=p(sys.argv[1]), focal={FOCAL}, out=p(sys.argv[2])),"
-        "large.Large(part_rows=200, tables='elements,residuals,points,reliability'))"
-    )
     process = subprocess.Popen(
-        [sys.executable, "-c", script, str(folder / "table.parquet"), str(out)]
+        [sys.executable, "-c", STOPPED, str(folder / "table.parquet"), str(out)]
     )
     journal = out.with_name(f"{out.name}.unfinished") / JOURNAL
     until = time.monotonic() + 120
@@ -272,74 +218,6 @@ def test_a_killed_run_is_resumed_to_the_same_bytes(folder, whole):
     ).stat().st_mtime_ns == before  # not done twice
     assert contents(out) == contents(whole)
     assert not unfinished.exists()
-
-
-def test_cleaning_keeps_every_row_with_its_verdict(folder, measured):
-    long = [
-        measured["pair"].count(name) > 10 for name in measured["pair"]
-    ]  # pairs of one size: one program
-    measured = {
-        name: [v for v, use in zip(values, long, strict=True) if use]
-        for name, values in measured.items()
-    }
-    wrong = dict(measured, y_right=list(measured["y_right"]))
-    at = [
-        i
-        for i, name in enumerate(measured["pair"])
-        if measured["pair"].index(name) == i and int(name[1:]) % 4 == 0
-    ]
-    for i in at:
-        wrong["y_right"][i] += 1.0
-    pq.write_table(pa.table(wrong), folder / "wrong.parquet")
-    out = folder / "clean"
-    arguments = ("--focal", FOCAL, "--procedure", "three-sigma", "--out", out)
-    found = run("clean", folder / "wrong.parquet", *arguments)
-    assert found.exit_code in (0, 1)
-    cleaned = pq.read_table(out / "cleaned")
-    assert cleaned.num_rows == len(measured["pair"])
-    for name, values in wrong.items():
-        assert cleaned.column(name).to_pylist() == values
-    kept = np.array(cleaned.column("kept").to_pylist())
-    with (folder / "wrong.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([list(wrong), *zip(*wrong.values(), strict=True)])
-    plain = run("clean", folder / "wrong.csv", *arguments[:-1], folder / "clean_plain")
-    assert plain.exit_code == found.exit_code
-    with (folder / "clean_plain" / "cleaned.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [r["verdict"] == "kept" for r in rows] == kept.tolist()
-    q = cleaned.column("q_mm").to_numpy()
-    np.testing.assert_allclose(q, [float(r["q_mm"] or "nan") for r in rows], atol=1e-8)
-    assert pq.read_table(out / "residuals").num_rows == kept.sum()
-
-    # what holds no number is no point that the procedure rejected
-    lost, name = measured["pair"].index("p101"), "p101"
-    pq.write_table(
-        pa.table(
-            wrong
-            | {
-                "x_left": [
-                    None if i == lost else x for i, x in enumerate(wrong["x_left"])
-                ]
-            }
-        ),
-        folder / "lost.parquet",
-    )
-    assert (
-        run(
-            "clean", folder / "lost.parquet", *arguments[:-1], folder / "lost"
-        ).exit_code
-        == 1
-    )
-    before, after = (
-        pq.read_table(place / "elements").to_pylist()
-        for place in (out, folder / "lost")
-    )
-    assert {row["pair"]: row["result"] for row in after}[name] == "non_finite_input"
-    assert [a for a in before if a["pair"] != name] == [
-        b for b in after if b["pair"] != name
-    ]
-    row = pq.read_table(folder / "lost" / "cleaned").slice(lost, 1).to_pylist()[0]
-    assert (row["kept"], row["order"], row["statistic"]) == (False, 0, np.inf)
 
 
 def test_the_exit_code_tells_of_pairs_that_are_not_cleaned(folder):
@@ -716,7 +594,7 @@ def test_a_cluster_that_does_not_answer_is_told(folder, tmp_path, monkeypatch):
     assert found.exit_code == 2 and "RAY_ADDRESS: found 127.0.0.1:1" in found.output
 
 
-CLUSTER = """
+CLUSTER = f"""{QUICK}
 import os, signal, subprocess, sys, pathlib
 import ray
 from jaxro.commands import cluster
@@ -724,7 +602,11 @@ from jaxro.commands import large
 from jaxro.commands.request import Options
 
 if __name__ == "__main__":
-    ray.init(num_cpus=2, log_to_driver=False)
+    ray.init(
+        num_cpus=2,
+        log_to_driver=False,
+        runtime_env={{"worker_process_setup_hook": quick}},
+    )
 
     def engine(job, told):
         for number, entry in enumerate(cluster.on_ray(job, told)):
@@ -746,10 +628,7 @@ def test_a_cluster_that_loses_a_worker_ends_in_the_same_bytes(folder, whole):
     pytest.importorskip("ray")
     script = folder / "cluster.py"
     script.write_text(CLUSTER)
-    environment = os.environ | {
-        "JAXRO_CACHE": str(folder / "cache"),
-        "PYTHONPATH": os.pathsep.join(sys.path),
-    }
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     command = [
         sys.executable,
         str(script),

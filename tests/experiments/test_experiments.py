@@ -13,10 +13,9 @@ import oracles
 import problems
 import pytest
 from bad_tables import write
+from command_line import run, words
 from jaxtyping import Array, Float
-from typer.testing import CliRunner
 
-from jaxro.cli import app
 from jaxro.experiments import (
     burshtynskaya1989,
     burshtynskaya1989_conclusions as conclusions,
@@ -39,18 +38,6 @@ from jaxro.rejection.rounds import (
 from jaxro.tables.examples import mock_pair as mock_example
 
 SIGMA, TRIALS = 0.01, 40
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
-    assert result.exception is None or isinstance(result.exception, SystemExit), (
-        result.exception
-    )
-    return result
-
-
-def words(text):
-    return " ".join(text.split())
 
 
 def layout():
@@ -464,14 +451,3 @@ def test_the_rates_of_1989_with_the_tolerance_that_fits():
         "II-9"
     ][0] == [7]
     assert "21" in words(run("reproduce", "burshtynskaya1989", "--trials", 34).stdout)
-
-
-def test_tables_of_1982_have_room_on_a_narrow_terminal():
-    typer = pytest.importorskip("typer.testing")
-    from jaxro.cli import app
-
-    done = typer.CliRunner().invoke(
-        app, ["reproduce", "gutkin1982"], env={"COLUMNS": "80"}
-    )
-    assert done.exit_code == 0 and "\u2026" not in done.output
-    assert max(map(len, done.output.splitlines())) <= 80

@@ -117,7 +117,9 @@ def test_planted_errors_go_where_they_are_sent():
 
 
 def test_random_pairs_are_true_and_anywhere():
-    pairs, poses = random_pairs(jax.random.key(5), 300, 9, focal=100.0)
+    made = jax.jit(lambda key: random_pairs(key, 300, 9, focal=100.0))
+    pairs, poses = made(jax.random.key(5))
+    poses = jax.tree.map(np.asarray, poses)
     coordinates = np.stack([np.asarray(c) for c in pairs.coordinates])
     assert coordinates.shape == (4, 300, 9)
     turns, bases = [], []

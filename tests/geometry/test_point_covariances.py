@@ -345,7 +345,7 @@ def test_cleaning_many_pairs(known, with_wrong):
     np.testing.assert_array_equal(kept, np.concatenate([~wrong, ~wrong]))
 
 
-def test_what_cannot_use_covariances_refuses(pair):
+def test_what_cannot_use_covariances_refuses(pair, oriented):
     for procedure in (rejection.ThreeSigma(), rejection.Dorozhinsky()):
         with pytest.raises(ValueError, match="cannot use the covariances"):
             procedure(pair)
@@ -356,8 +356,9 @@ def test_what_cannot_use_covariances_refuses(pair):
         with pytest.raises(ValueError, match="leave out the sigma of the procedure"):
             procedure(pair)
     batch = jaxro.stack([pair, pair])
+    both = jax.tree.map(lambda a: jnp.stack([a, a]), oriented)
     with pytest.raises(ValueError, match=r"variance_components: .* covariances"):
-        jaxro.variance_components.by_photo(batch, jaxro.orient_batch(batch))
+        jaxro.variance_components.by_photo(batch, both)
 
 
 def test_parallax_residuals_are_those_of_sigma_alone(pair):

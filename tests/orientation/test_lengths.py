@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import problems
 import pytest
 
 import jaxro
@@ -49,12 +51,28 @@ def compare(one, other, tolerance: float = 1e-9) -> None:
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("points", [3, 5, 9, 13, 16, 37])
-def test_a_pair_of_any_length_is_that_of_its_own_program(points):
+VERTICAL = jaxro.starts.Vertical()
+
+
+@pytest.mark.parametrize(
+    ("points", "start"),
+    [
+        (9, jaxro.starts.Auto()),
+        (5, VERTICAL),
+        (37, VERTICAL),
+        *(
+            pytest.param(n, jaxro.starts.Auto(), marks=pytest.mark.slow)
+            for n in (3, 13, 16)
+        ),
+    ],
+)
+def test_a_pair_of_any_length_is_that_of_its_own_program(points, start):
+    """What is compiled for it alone is the whole of a start, or that from the vertical,
+    where `orient` ends."""
     pair = near_vertical(points)
     alone = jaxro.orient(pair)
     assert alone.residuals.shape == (points,)
-    expected = jax.jit(jaxro.orient)(pair)
+    expected = problems.jit(partial(jaxro.orient, start=start))(pair)
     assert bool(alone.result == expected.result)
     if not bool(expected.usable):
         assert not bool(alone.usable)
@@ -65,7 +83,7 @@ def test_a_pair_of_any_length_is_that_of_its_own_program(points):
 def test_a_length_that_is_new_compiles_nothing():
     """Nine to twelve points have twelve places: one program serves them all."""
     jaxro.orient(near_vertical(12))
-    data_snooping = DataSnooping(sigma=0.01)
+    data_snooping = DataSnooping()
     data_snooping(near_vertical(12))
     pairs = [near_vertical(points) for points in (9, 10, 11, 12)]
     with counted() as programs:
@@ -83,10 +101,10 @@ def test_transformations_without_jit_compile_once():
         moved = jaxro.pair(
             x_left, *pair.coordinates[1:], focal=pair.focal_left, sigma=pair.sigma
         )
-        return jaxro.orient(moved, start=jaxro.starts.Vertical()).pose.by
+        return jaxro.orient(moved, start=VERTICAL).pose.by
 
     gradient = jax.grad(by)(pair.x_left)
-    orient = lambda pair: jaxro.orient(pair, start=jaxro.starts.Vertical())
+    orient = lambda pair: jaxro.orient(pair, start=VERTICAL)
     mapped = jax.vmap(orient)(batch)
     with counted() as programs:
         again = jax.grad(by)(pair.x_left)
@@ -99,14 +117,17 @@ def test_transformations_without_jit_compile_once():
     np.testing.assert_allclose(gradient[3], slope, rtol=1e-5, atol=1e-9)
 
 
-def test_a_cleaned_pair_of_any_length_is_that_of_its_own_program():
+@pytest.mark.parametrize(
+    "procedure",
+    [DataSnooping(), pytest.param(Recommended(), marks=pytest.mark.slow)],
+)
+def test_a_cleaned_pair_of_any_length_is_that_of_its_own_program(procedure):
     pair = near_vertical(11)
     pair = mock_pairs.plant(pair, y_right=jnp.zeros(11).at[4].set(0.3))
-    procedure = Recommended()
     found = procedure(pair)
     assert found.outcome == OUTCOMES.finished
     assert np.flatnonzero(~np.asarray(found.mask)).tolist() == [4]
-    expected = jax.jit(procedure.clean)(pair)
+    expected = problems.jit(procedure.clean)(pair)
     compare(found.orientation, expected.orientation)
     np.testing.assert_array_equal(found.mask, expected.mask)
     np.testing.assert_array_equal(found.order, expected.order)
@@ -118,6 +139,7 @@ def test_an_orientation_shows_its_numbers():
     assert shown.startswith("successful\nby ")
     assert "kappa" in shown
     assert shown.endswith("7 degrees of freedom")
-    assert "rotation" in str(jaxro.orient(pair))
-    batch = jax.tree.map(lambda a: jnp.stack([a, a]), pair)
-    assert str(jaxro.orient_batch(batch)) == "2 of 2 pairs usable"
+    found = jaxro.orient(pair)
+    assert "rotation" in str(found)
+    batch = jax.tree.map(lambda a: jnp.stack([a, a]), found)
+    assert str(batch) == "2 of 2 pairs usable"

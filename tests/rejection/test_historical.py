@@ -118,7 +118,7 @@ def random_pairs(count, *layouts):
     """`count` pairs, as many of each layout."""
     keys = jax.random.split(jax.random.key(0), (len(layouts), count // len(layouts)))
     made = [
-        jax.vmap(partial(random_pair, layout=layout))(k)
+        problems.jit(jax.vmap(partial(random_pair, layout=layout)))(k)
         for layout, k in zip(layouts, keys, strict=True)
     ]
     return jax.tree.map(lambda *fields: jnp.concatenate(fields), *made)

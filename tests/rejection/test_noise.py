@@ -32,9 +32,13 @@ def residuals(
     return np.concatenate([at_right, at_wrong], axis=1)
 
 
+every = jax.jit(jax.vmap(noise_of))
+"""The noise of every pair, of squares and of which points are used."""
+
+
 def estimated(r: np.ndarray):
     """The noise of every pair."""
-    return jax.jit(jax.vmap(noise_of))(jnp.asarray(r**2), jnp.ones(r.shape, bool))
+    return every(jnp.asarray(r**2), jnp.ones(r.shape, bool))
 
 
 @pytest.mark.parametrize("points", [16, 50, 200])
@@ -67,25 +71,32 @@ def test_the_unit_does_not_matter_and_padding_is_not_seen():
     """sigma follows the unit; masked points change nothing; the order of the points
     neither."""
     r = residuals(50, 20, True, 1)[0]
-    found = noise_of(jnp.asarray(r**2), jnp.ones(50, bool))
-    metres = noise_of(jnp.asarray((r / 1000) ** 2), jnp.ones(50, bool))
+    mixed = np.random.default_rng(1).permutation(60)
+    padded = np.append(r, np.full(10, 1e3))
+    rows = np.stack([padded, padded / 1000, padded[mixed], np.append(r, np.zeros(10))])
+    used = np.stack([np.arange(60) < 50] * 4)
+    used[2] = mixed < 50
+    given, metres, among, with_zeros = split(every(rows**2, used))
+    found = split(every(r[None] ** 2, np.ones((1, 50), bool)))[0]
+    for same in (given, among, with_zeros):
+        np.testing.assert_allclose(same.sigma, found.sigma, rtol=1e-9)
     np.testing.assert_allclose(metres.sigma * 1000, found.sigma, rtol=1e-9)
     np.testing.assert_allclose(
         metres.deviation / metres.sigma, found.deviation / found.sigma, rtol=1e-9
     )
-    mixed = np.random.default_rng(1).permutation(60)
-    padded = np.append(r, np.full(10, 1e3))[mixed]
-    among = noise_of(jnp.asarray(padded**2), jnp.asarray(mixed < 50))
-    np.testing.assert_allclose(among.sigma, found.sigma, rtol=1e-9)
+
+
+def split(batch) -> list:
+    """The single results of a batch."""
+    return [jax.tree.map(lambda a, i=i: a[i], batch) for i in range(len(batch.sigma))]
 
 
 def test_nothing_is_known_without_redundancy():
     """Five points, no points, and errorless points: no number that looks like an
     answer."""
-    few = noise_of(jnp.asarray([1e-4, 2e-4, 1e-5, 3e-4, 1e-4]), jnp.ones(5, bool))
-    none = noise_of(jnp.zeros(8), jnp.zeros(8, bool))
-    exact = noise_of(jnp.zeros(8), jnp.ones(8, bool))
-    for found in (few, none, exact):
+    squares, used = np.zeros((3, 8)), np.zeros((3, 8), bool)
+    squares[0, :5], used[0, :5], used[2] = (1e-4, 2e-4, 1e-5, 3e-4, 1e-4), True, True
+    for found in split(every(squares, used)):
         assert found.sigma == 0 and not found.known and np.isinf(found.deviation)
 
 
@@ -97,10 +108,9 @@ def test_pooled_is_the_truth_in_spite_of_bad_pairs():
     r = residuals(50, 15, False, tables * pairs)
     squares = np.reshape(r**2, (tables, pairs, 50))
     squares[:, :3] *= 900.0
-    found = jax.vmap(jax.vmap(noise_of))(
-        jnp.asarray(squares), jnp.ones(squares.shape, bool)
+    together = jax.jit(jax.vmap(lambda s, use: pooled(jax.vmap(noise_of)(s, use))))(
+        squares, np.ones(squares.shape, bool)
     )
-    together = jax.jit(jax.vmap(pooled))(found)
     ratio = np.asarray(together.sigma) / SIGMA
     assert 0.98 < np.median(ratio) < 1.02
     assert (

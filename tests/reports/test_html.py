@@ -4,6 +4,7 @@ it."""
 import html
 import re
 
+import examples
 import numpy as np
 import pytest
 from command_line import run, words
@@ -22,16 +23,8 @@ LARGEST = 10_000_000
 HEADER = "pair,point,x_left,y_left,x_right,y_right\n"
 
 
-COMMANDS = (
-    ("orient",),
-    ("clean",),
-    ("calibrate", "--model", "one-f"),
-    ("block",),
-    ("heights",),
-)
-"""The examples."""
-
-NAMES = [name for name, *_ in COMMANDS]
+ODD_NAME = "<b onclick=x>&[red]"
+"""A point of the first pair of `many`."""
 
 
 def simulated(pairs: int, points: int, seed: int = 1) -> str:
@@ -55,23 +48,11 @@ def simulated(pairs: int, points: int, seed: int = 1) -> str:
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory):
-    """The reports of the examples by the names of their commands, with what the terminal
-    said."""
-    folder = tmp_path_factory.mktemp("reports")
-    found = {}
-    for name, *options in COMMANDS:
-        result = run(name, *options, "--report", folder / f"{name}.html")
-        assert result.exit_code == 0
-        found[name] = folder / f"{name}.html", result.stdout
-    return found
-
-
-@pytest.fixture(scope="module")
 def many(tmp_path_factory):
     """The report of 400 pairs."""
     folder = tmp_path_factory.mktemp("many")
-    (folder / "table.csv").write_text(simulated(400, 12))
+    table = simulated(400, 12).replace("\n1,7,", f"\n1,{ODD_NAME},")
+    (folder / "table.csv").write_text(table)
     result = run(
         *("orient", folder / "table.csv", "--focal", "150", "--sigma", "0.005"),
         *("--report", folder / "report.html"),
@@ -86,10 +67,10 @@ def shown(page: str) -> str:
     return words(html.unescape(re.sub(r"<[^>]+>", " ", page)))
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_page_is_whole_and_says_what_the_terminal_says(pages, name):
-    file, told = pages[name]
-    page = file.read_text(encoding="utf-8")
+@pytest.mark.parametrize("name", examples.ARGUMENTS)
+def test_page_is_whole_and_says_what_the_terminal_says(example, name):
+    assert example(name).exit_code == 0
+    told, page = example(name).stdout, example(name).report.read_text(encoding="utf-8")
     assert not re.search(
         r"(src|href)=(?![\"']?(#|data:))", re.sub(r"xlink:href", "", page)
     )
@@ -105,16 +86,10 @@ def test_page_is_whole_and_says_what_the_terminal_says(pages, name):
     assert "How to repeat this" in text and "jaxro" in text
 
 
-def test_names_are_no_markup(tmp_path):
-    table = simulated(1, 12).replace("1,7,", "1,<b onclick=x>&[red],")
-    (tmp_path / "table.csv").write_text(table)
-    run(
-        *("orient", tmp_path / "table.csv", "--focal", "150"),
-        *("--report", tmp_path / "report.html"),
-    )
-    page = (tmp_path / "report.html").read_text()
+def test_names_are_no_markup(many):
+    page = many[0].read_text(encoding="utf-8")
     assert "<b onclick" not in page
-    assert "<b onclick=x>&[red]" in shown(page)
+    assert ODD_NAME in shown(page)
 
 
 def test_report_of_many_pairs_details_the_worst(many):
@@ -193,16 +168,16 @@ def test_browser_sorts_searches_and_follows_links(many):
         assert not errors(driver)
 
 
-@pytest.mark.parametrize("name", ["clean", "block", "calibrate"])
-def test_page_fits_a_phone(pages, name):
+def test_pages_fit_a_phone(example):
     """Nothing but the tables, in their own frames, is wider than the window."""
     with browser(width=500) as driver:
-        open_page(driver, pages[name][0])
-        wide, window = driver.execute_script(
-            "return [document.documentElement.scrollWidth, innerWidth]"
-        )
-        assert wide <= window
-        assert not errors(driver)
+        for name in ("clean", "block", "calibrate"):
+            open_page(driver, example(name).report)
+            wide, window = driver.execute_script(
+                "return [document.documentElement.scrollWidth, innerWidth]"
+            )
+            assert wide <= window, name
+            assert not errors(driver)
 
 
 def test_refused_before_anything_is_calculated(tmp_path):

@@ -14,7 +14,11 @@ import numpy as np
 import pytest
 
 import jaxro
+from jaxro import adjust
+from jaxro.adjustment import Term
+from jaxro.adjustment.losses import Tukey
 from jaxro.geometry import mock_pairs
+from jaxro.rejection import DataSnooping, Recommended, Reweighting
 from jaxro.xla import programs
 from jaxro.xla.programs import compiled, jit_in_this_thread
 from jaxro.xla.settings import RUN_FAST
@@ -108,6 +112,60 @@ def test_what_a_function_refers_to_is_never_the_one_of_an_earlier_call(monkeypat
     np.testing.assert_allclose(of(of_state), [3.0, 3.0])
     np.testing.assert_allclose(of(in_numpy(np.array([np.pi / 2]))), [3.0, 3.0])
     np.testing.assert_allclose(of(lambda x: -x), [-1.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def compilations():
+    """How many programs were compiled so far."""
+    events = []
+    note = lambda event, seconds, **_: events.append(event)
+    jax.monitoring.register_event_duration_secs_listener(note)
+    return lambda: events.count("/jax/core/compile/backend_compile_duration")
+
+
+def adjust_line(shift, sigma):
+    """A straight line through points, with a condition that is written anew."""
+    x = jnp.arange(5.0)
+    y = jnp.array([1.0, 2.1, 2.9, 4.2, 5.0])
+
+    def line(parameters, point):
+        a, b = parameters
+        return a * point[0] + b - point[1] - shift
+
+    start = (jnp.zeros(()), jnp.zeros(()))
+    return adjust(Term(line, (x, y), (None, sigma**2)), start)
+
+
+def test_an_adjustment_is_one_program_for_all_numbers(compilations):
+    adjust_line(jnp.asarray(0.5), 0.1)  # compiles small programs of the test, too
+    before = compilations()
+    found = adjust_line(jnp.asarray(1.5), 0.2)
+    assert compilations() == before
+    slope, constant = np.polyfit(np.arange(5.0), [1.0, 2.1, 2.9, 4.2, 5.0], 1)
+    np.testing.assert_allclose(found.parameters, [slope, constant + 1.5], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "procedure",
+    [
+        lambda level, sigma: DataSnooping(level=level, sigma=sigma),
+        lambda level, sigma: Recommended(level=level, sigma=sigma),
+        lambda level, sigma: Reweighting(Tukey(scale=40 * level), sigma=sigma),
+    ],
+    ids=["data-snooping", "recommended", "tukey"],
+)
+def test_procedures_are_one_program_for_all_tolerances(procedure, compilations):
+    errors = jnp.asarray(0.003 * np.sin(7.0 * np.arange(16.0) ** 2)).at[11].add(0.8)
+    exact = mock_pairs.mock_pair(mock_pairs.standard_layout(16))
+    pair = mock_pairs.plant(exact, y_right=errors)
+    first = procedure(0.1, 0.002)(pair)
+    before = compilations()
+    found = procedure(0.11, 0.003)(pair), procedure(0.12, None)(pair.with_sigma(0.003))
+    assert compilations() == before
+    for one in found:
+        np.testing.assert_array_equal(np.flatnonzero(~one.mask), [11])
+        ratio = first.orientation.sigma0 / one.orientation.sigma0
+        np.testing.assert_allclose(ratio, 1.5, rtol=1e-6)
 
 
 def test_old_programs_are_given_back(monkeypatch):
