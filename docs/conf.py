@@ -13,11 +13,13 @@ for a part that the build makes:
 """
 
 import importlib
+import os
 import re
 import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
+os.environ["JAXRO_QUIET"] = "1"  # pages show what their code prints, and no more
 sys.path.insert(0, str(HERE))
 
 from pygments.lexers.special import TextLexer  # noqa: E402

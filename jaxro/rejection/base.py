@@ -174,7 +174,7 @@ def take_sigma(
     usable = np.isfinite(own) & (own > 0)  # others say that a point is none
     stated = np.where(usable, np.asarray(sigma, own.dtype), own)
     procedure = dataclasses.replace(procedure, sigma=None)  # pyright: ignore[reportCallIssue]
-    return procedure, dataclasses.replace(pair, sigma=stated)
+    return procedure, eqx.tree_at(lambda pair: pair.sigma, pair, stated)
 
 
 class Decision(NamedTuple):

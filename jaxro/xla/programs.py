@@ -245,7 +245,15 @@ class Program:
             # compiled as a part of the caller's program, or, under a `grad` or `vmap`
             # that nobody compiles, by itself and once
             return _as_part(source.function, structure)(*numbers)
-        settings = source.settings
+        # within a program of the caller's, what is known is computed while it is traced
+        with jax.ensure_compile_time_eval():
+            return self._choose_settings(data, numbers, structure)
+
+    def _choose_settings(
+        self, data: tuple, numbers: list, structure: _Structure
+    ) -> Any:
+        """The result by the program of the settings that fit."""
+        source, settings = self._source, self._source.settings
         if callable(settings):
             settings = settings(*data, **self._options, **self._held)
         every = tuple(settings.items())

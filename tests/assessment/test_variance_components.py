@@ -89,8 +89,9 @@ def test_steps_do_not_run_in_a_circle():
     assert np.all(found.converged) and np.all(found.estimable[:, 1:])
     sigma = np.asarray(found.sigma)
     np.testing.assert_allclose(sigma[:, 1:], np.tile(truth[1:], (40, 1)), rtol=0.4)
-    off = np.abs(sigma[:, 0] ** 2 - truth[0] ** 2)
-    assert np.all(off < 4 * np.asarray(found.variance_error)[:, 0])
+    # thirty pairs tell the error of so small a variance to a third of it only
+    off = (sigma[:, 0] ** 2 - truth[0] ** 2) / np.asarray(found.variance_error)[:, 0]
+    assert 0.7 < np.sqrt(np.mean(off**2)) < 1.7 and np.all(np.abs(off) < 6)
 
 
 def test_classes_of_points_in_near_vertical_pairs():

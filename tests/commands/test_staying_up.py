@@ -22,13 +22,13 @@ from jaxro.commands.stream import CONVERTED
 from jaxro.reports.columns import TABLES
 from jaxro.reports.terminal import (
     Spent,
-    say_compiling,
     steady_streams,
     stopwatch,
 )
 from jaxro.tables import whole
 from jaxro.tables.examples import pair as pair_example
 from jaxro.tables.fields import TableError
+from jaxro.xla import notices
 
 FOCAL = ["--focal", str(pair_example.FOCAL)]
 COMMAND = [sys.executable, "-m", "jaxro"]
@@ -340,7 +340,7 @@ def test_semicolons_and_decimal_commas(table, tmp_path):
 
 def test_the_time_for_compiling_is_told_beside_the_work():
     spent = stopwatch()
-    with say_compiling((3, 20)), say_compiling((3, 40)):
+    with notices.compiling("one program"), notices.compiling("another"):
         time.sleep(0.2)
     time.sleep(0.1)
     found = spent()
