@@ -172,9 +172,6 @@ def stopwatch() -> Callable[[], Spent]:
     return spent
 
 
-SOON = 1.0
-"""Seconds after which a user is told what he waits for."""
-
 LEAST_TOLD = 0.05
 """Seconds of compiling that are told of."""
 
@@ -188,12 +185,12 @@ def say_compiling(line: str) -> None:
 @contextmanager
 def say_what(line: str) -> Iterator[None]:
     """Around a work that nothing tells of: the line on the terminal if it takes longer
-    than SOON."""
+    than `notices.SOON`."""
     if sys.stderr is None or not sys.stderr.isatty():
         yield
         return
     say = lambda: print(tell(line), file=sys.stderr, flush=True)
-    timer = threading.Timer(SOON, say)
+    timer = threading.Timer(notices.SOON, say)
     timer.daemon = True
     timer.start()
     try:

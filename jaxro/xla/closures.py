@@ -1,12 +1,12 @@
 """Functions as trees: what a function closes over becomes arguments of its program.
 
 A function that a caller writes anew for every call, a lambda or an inner function, is
-another object each time, though its code is the same. `opened` turns it into a tree of
-its code and of what it refers to: two functions of the same code have equal trees but
-for their arrays, so that one compiled program serves both.
+another object each time, though its code is the same. `open_function` turns it into a
+tree of its code and of what it refers to: two functions of the same code have equal
+trees but for their arrays, so that one compiled program serves both. A function that
+refers to what may change unseen, a class or a module of the caller's, is `Unknown`.
 """
 
-import builtins
 import dis
 import enum
 import functools
@@ -27,9 +27,12 @@ VERSIONED = (
 """Packages whose functions do not change while a process runs, and whose versions are
 known: a function of theirs is what its name says."""
 
+KNOWN = frozenset(VERSIONED) | sys.stdlib_module_names
+"""These and Python's own, in which nothing changes unseen."""
+
 FIXED = (
-    *(type(None), bool, int, float, complex, str, bytes, type, range, slice),
-    *(types.BuiltinFunctionType, types.ModuleType, enum.Enum, np.dtype),
+    *(type(None), str, bytes, range, slice),
+    *(types.BuiltinFunctionType, enum.Enum, np.dtype),
 )
 """Types of values that are part of the code: nothing in them can change unseen."""
 
@@ -137,8 +140,9 @@ def keep_constants(tree: PyTree) -> bool:
 
 
 def package_of(thing: Any) -> str:
-    """The package in which a function or class is written."""
-    return (getattr(thing, "__module__", None) or "").partition(".")[0]
+    """The package that a module is of, or in which a function or class is written."""
+    name = "__name__" if isinstance(thing, types.ModuleType) else "__module__"
+    return (getattr(thing, name, None) or "").partition(".")[0]
 
 
 def is_versioned(thing: Any) -> bool:
@@ -202,9 +206,12 @@ def _open_function(function: types.FunctionType, within: tuple) -> Opened:
 def _value(leaf: Any, within: tuple, constant: bool) -> Any:
     """What a function refers to, as a leaf or a tree. Raises `Unknown` where it may
     change without notice."""
-    fixed = isinstance(leaf, bool | int | float | complex)
-    if fixed or (constant and isinstance(leaf, np.ndarray)):
+    if isinstance(leaf, bool | int | float | complex):
         return Constant(leaf)
+    if isinstance(leaf, np.ndarray) and (constant or leaf.dtype.kind in "US"):
+        return Constant(leaf)
+    if isinstance(leaf, type | types.ModuleType) and package_of(leaf) in KNOWN:
+        return leaf
     opened = _open(leaf, within)
     if opened is not leaf or isinstance(leaf, (*FIXED, *ARRAYS, types.FunctionType)):
         return opened
@@ -220,7 +227,7 @@ def _used_globals(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
         return
     names = function.__globals__
     for name in sorted(_global_names(function.__code__)):
-        if name in names and not hasattr(builtins, name):
+        if name in names:
             yield name, names[name]
 
 

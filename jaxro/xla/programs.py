@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from functools import cached_property, lru_cache, update_wrapper, wraps
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -225,18 +226,23 @@ class Program:
             return self._call(data)
 
     def _call(self, data: tuple) -> Any:
-        options = self._options | self._held
         try:
             numbers, structure = _divide(data, self._options, self._held)
         except Unknown:
-            # nothing tells whether it is what it was: compiled for this call alone
-            return jax.jit(lambda: self._source.function(*data, **options))()
+            return self._alone(*data)
         try:
             return self._choose(data, numbers, structure)
         except _NO_ARGUMENT:
             if not keep_constants(structure.restore(numbers)):
                 raise
         return self._choose(data, *_divide(data, self._options, self._held))
+
+    @cached_property
+    def _alone(self) -> Callable:
+        """The function where nothing tells whether it is what it was: compiled for the
+        calls of this object, and no longer."""
+        options = self._options | self._held
+        return eqx.filter_jit(lambda *data: self._source.function(*data, **options))
 
     def _choose(self, data: tuple, numbers: list, structure: _Structure) -> Any:
         """The result by the program that fits."""

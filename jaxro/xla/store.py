@@ -18,7 +18,6 @@ import os
 import pickle
 import platform
 import stat
-import sys
 import tempfile
 import threading
 import types
@@ -32,7 +31,7 @@ from typing import Any
 import jax
 from jaxtyping import PyTree
 
-from .closures import VERSIONED, Module, package_of
+from .closures import KNOWN, Module, package_of
 
 MAX_BYTES = 1 << 29
 """Of all programs that are kept, of about 1 MB each; those not used for longest go."""
@@ -214,13 +213,9 @@ def _checked(stored: Callable, make: Callable[[], Callable]) -> Callable:
     return lambda *numbers: (program[0] if program else first)(*numbers)
 
 
-_KNOWN_PACKAGES = frozenset(VERSIONED) | sys.stdlib_module_names
-"""Packages whose versions are part of every key."""
-
-
 def _is_known(thing: Callable | type) -> bool:
     """Whether the name of a function or class says all of it."""
-    return package_of(thing) in _KNOWN_PACKAGES and "<" not in thing.__qualname__
+    return package_of(thing) in KNOWN and "<" not in thing.__qualname__
 
 
 class _Pickler(pickle.Pickler):
@@ -232,7 +227,7 @@ class _Pickler(pickle.Pickler):
                 raise pickle.PicklingError(f"{obj} is a caller's own")
             return obj.__module__, obj.__qualname__
         if isinstance(obj, types.ModuleType):
-            if obj.__name__.partition(".")[0] not in _KNOWN_PACKAGES:
+            if package_of(obj) not in KNOWN:
                 raise pickle.PicklingError(f"{obj} is a caller's own")
             return obj.__name__
         if isinstance(obj, types.CodeType):

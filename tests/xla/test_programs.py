@@ -33,12 +33,21 @@ class Loss(eqx.Module):
 
 SHIFT = np.array([1.0, 2.0])
 FACTOR = 2.0
+range = 2.0  # a name of Python's own, with another meaning here
+
+
+class Settings:
+    """A class that a caller uses as a place for numbers."""
+
+    factor = 2.0
+
+
+this_module = sys.modules[__name__]
 
 
 def scaled(x, *, loss, also=None):
     traced.append(True)
-    for _ in range(loss.rounds):
-        x = x * loss.scale
+    x = x * loss.scale**loss.rounds
     return x if also is None else also(x)
 
 
@@ -98,18 +107,24 @@ def test_functions_are_compared_by_their_code(way):
 def test_what_a_function_refers_to_is_never_the_one_of_an_earlier_call(monkeypatch):
     x, here = np.ones(2), sys.modules[__name__]
     of_globals = lambda x: x * FACTOR + SHIFT
+    of_builtin, of_class = lambda x: x * range, lambda x: x * Settings.factor
+    of_module = lambda x: x * this_module.FACTOR
     state = type("State", (), {"factor": 2.0})()
     of_state = lambda x: x * state.factor
     in_numpy = lambda table: lambda x: x + np.sin(table)[0] + table.shape[0]
     of = lambda also: run(x, loss=Loss(rounds=0), also=also)
     np.testing.assert_allclose(of(of_globals), [3.0, 4.0])
-    np.testing.assert_allclose(of(of_state), [2.0, 2.0])
+    for also in (of_state, of_builtin, of_class, of_module):
+        np.testing.assert_allclose(of(also), [2.0, 2.0])
     np.testing.assert_allclose(of(in_numpy(np.zeros(1))), [2.0, 2.0])
     monkeypatch.setattr(here, "SHIFT", np.array([5.0, 6.0]))
-    monkeypatch.setattr(here, "FACTOR", 1.0)
+    monkeypatch.setattr(here, "FACTOR", 3.0)
+    monkeypatch.setattr(here, "range", 3.0)
+    monkeypatch.setattr(Settings, "factor", 3.0)
     state.factor = 3.0
-    np.testing.assert_allclose(of(of_globals), [6.0, 7.0])
-    np.testing.assert_allclose(of(of_state), [3.0, 3.0])
+    np.testing.assert_allclose(of(of_globals), [8.0, 9.0])
+    for also in (of_state, of_builtin, of_class, of_module):
+        np.testing.assert_allclose(of(also), [3.0, 3.0])
     np.testing.assert_allclose(of(in_numpy(np.array([np.pi / 2]))), [3.0, 3.0])
     np.testing.assert_allclose(of(lambda x: -x), [-1.0, -1.0])
 
@@ -171,7 +186,7 @@ def test_procedures_are_one_program_for_all_tolerances(procedure, compilations):
 def test_old_programs_are_given_back(monkeypatch):
     monkeypatch.setattr(programs._programs, "_most", 3)
     twice = compiled(lambda x: 2 * x)
-    for size in range(8):
+    for size in np.arange(8):
         twice(np.zeros(size))
     assert len(programs._programs._kept) <= 3
 
