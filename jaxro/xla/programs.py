@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend.core import get_opaque_trace_state
 from jaxtyping import PyTree
 
 from . import notices, store
@@ -251,6 +252,8 @@ class Program:
             # compiled as a part of the caller's program, or, under a `grad` or `vmap`
             # that nobody compiles, by itself and once
             return _as_part(source.function, structure)(*numbers)
+        if get_opaque_trace_state() == _NOTHING_TRACED:
+            return self._choose_settings(data, numbers, structure)
         # within a program of the caller's, what is known is computed while it is traced
         with jax.ensure_compile_time_eval():
             return self._choose_settings(data, numbers, structure)
@@ -329,6 +332,10 @@ def _shape(leaf: Any) -> tuple:
     """What a program depends on of an argument."""
     dtype = getattr(leaf, "dtype", None)
     return (type(leaf),) if dtype is None else (leaf.shape, dtype)
+
+
+_NOTHING_TRACED = get_opaque_trace_state()
+"""The state of JAX where no program is being traced, as while this is imported."""
 
 
 class _Recent:

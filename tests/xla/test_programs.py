@@ -160,6 +160,23 @@ def test_an_adjustment_is_one_program_for_all_numbers(compilations):
     np.testing.assert_allclose(found.parameters, [slope, constant + 1.5], rtol=1e-12)
 
 
+def test_known_numbers_are_computed_while_a_program_is_traced():
+    outside = adjust_line(jnp.asarray(0.5), 0.1).parameters
+    within = jax.jit(lambda: adjust_line(jnp.asarray(0.5), 0.1).parameters)()
+    np.testing.assert_allclose(within, outside, rtol=1e-12)
+
+
+def test_a_first_call_is_few_programs(compilations):
+    """Constants within a program are no programs of their own."""
+    exact = mock_pairs.mock_pair(mock_pairs.standard_layout(16))
+    jax.block_until_ready(jaxro.orient(exact))
+    programs.forget()
+    jax.clear_caches()
+    before = compilations()
+    jaxro.orient(exact)
+    assert compilations() - before <= 3
+
+
 @pytest.mark.parametrize(
     "procedure",
     [
