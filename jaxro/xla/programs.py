@@ -15,7 +15,7 @@ import gc
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property, lru_cache, update_wrapper, wraps
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import PyTree
 
 from . import notices, store
-from .closures import FUNCTIONS, Unknown, keep_constants, open_function
+from .closures import Unknown, keep_constants
 from .settings import (
     COMPILE_FAST,
     NO_LIBRARY_SUMS,
@@ -39,6 +39,7 @@ from .settings import (
     plain,
     switched_off,
 )
+from .structure import Structure, divide
 
 MOST = 64
 """Programs that a process keeps; what was not used for longest goes."""
@@ -125,93 +126,6 @@ class Source(NamedTuple):
     unit: str | None
 
 
-class _Structure:
-    """All of the arguments but their numbers, compared by value: the structure of data,
-    of options and of what is held, each with its leaves."""
-
-    def __init__(self, *trees: tuple):
-        self.trees = trees
-        self._hash = hash(trees)
-
-    def restore(self, numbers: Sequence[Any]) -> list[Any]:
-        """Data, options and what is held, with these numbers in their places."""
-        rest = iter(numbers)
-        return [
-            structure.unflatten(
-                next(rest) if leaf is _NUMBER else leaf.value for leaf in leaves
-            )
-            for structure, leaves in self.trees
-        ]
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Structure) and self.trees == other.trees
-
-    def __reduce__(self):
-        return _Structure, tuple(
-            structure.unflatten(leaves) for structure, leaves in self.trees
-        )
-
-
-def _divide(
-    data: tuple, options: dict[str, Any], held: dict[str, Any]
-) -> tuple[list[Any], _Structure]:
-    """The numbers of the arguments, and all else of them. Raises `Unknown`."""
-    numbers: list[Any] = []
-    trees = (
-        _take_numbers(data, _is_number, numbers),
-        _take_numbers(options, _is_real, numbers),
-        _take_numbers(held, lambda leaf: False, numbers),
-    )
-    return numbers, _Structure(*trees)
-
-
-def _take_numbers(
-    tree: PyTree, is_argument: Callable[[Any], bool], numbers: list[Any]
-) -> tuple:
-    """The structure of a tree and its leaves, with _NUMBER in the place of each
-    argument, which is added to `numbers`."""
-    leaves, structure = jax.tree.flatten(tree)
-    if any(isinstance(leaf, FUNCTIONS) for leaf in leaves):
-        opened = [open_function(leaf) for leaf in leaves]
-        leaves, structure = jax.tree.flatten(structure.unflatten(opened))
-    kept = []
-    for leaf in leaves:
-        if is_argument(leaf):
-            numbers.append(leaf)
-            kept.append(_NUMBER)
-        else:
-            kept.append(_Leaf(leaf, type(leaf)))
-    return structure, tuple(kept)
-
-
-class _Leaf(NamedTuple):
-    """A leaf that is no argument; 1, 1.0 and True are three."""
-
-    value: Any
-    kind: type
-
-
-class _Number:
-    """Stands where a number is an argument of the program."""
-
-
-_NUMBER = _Number()
-_ARRAYS = (jax.Array, np.ndarray, np.generic)
-
-
-def _is_number(leaf: Any) -> bool:
-    """Whether a leaf of what is computed with is an argument of the program."""
-    return isinstance(leaf, (*_ARRAYS, bool, int, float, complex))
-
-
-def _is_real(leaf: Any) -> bool:
-    """Whether a leaf of the options is one."""
-    return isinstance(leaf, (*_ARRAYS, float))
-
-
 class Program:
     """data -> function(*data, **options), compiled."""
 
@@ -228,7 +142,7 @@ class Program:
 
     def _call(self, data: tuple) -> Any:
         try:
-            numbers, structure = _divide(data, self._options, self._held)
+            numbers, structure = divide(data, self._options, self._held)
         except Unknown:
             return self._alone(*data)
         try:
@@ -236,7 +150,7 @@ class Program:
         except _NO_ARGUMENT:
             if not keep_constants(structure.restore(numbers)):
                 raise
-        return self._choose(data, *_divide(data, self._options, self._held))
+        return self._choose(data, *divide(data, self._options, self._held))
 
     @cached_property
     def _alone(self) -> Callable:
@@ -245,7 +159,7 @@ class Program:
         options = self._options | self._held
         return eqx.filter_jit(lambda *data: self._source.function(*data, **options))
 
-    def _choose(self, data: tuple, numbers: list, structure: _Structure) -> Any:
+    def _choose(self, data: tuple, numbers: list, structure: Structure) -> Any:
         """The result by the program that fits."""
         source = self._source
         if is_traced(numbers):
@@ -258,9 +172,7 @@ class Program:
         with jax.ensure_compile_time_eval():
             return self._choose_settings(data, numbers, structure)
 
-    def _choose_settings(
-        self, data: tuple, numbers: list, structure: _Structure
-    ) -> Any:
+    def _choose_settings(self, data: tuple, numbers: list, structure: Structure) -> Any:
         """The result by the program of the settings that fit."""
         source, settings = self._source, self._source.settings
         if callable(settings):
@@ -285,7 +197,7 @@ class Program:
         return self._run(source.function, numbers, structure, every)
 
     def _run(
-        self, function: Callable, numbers: list, structure: _Structure, settings: tuple
+        self, function: Callable, numbers: list, structure: Structure, settings: tuple
     ) -> Any:
         key = function, structure, settings, self._plain
         place = *key, tuple(map(_shape, numbers)), store.active()
@@ -313,7 +225,7 @@ class Program:
     def outputs(self) -> dict[Any, PyTree]:
         """Room for a caller to keep the shapes of its results."""
         try:
-            _, structure = _divide((), self._options, self._held)
+            _, structure = divide((), self._options, self._held)
         except Unknown:
             return {}
         remembered = _remembered(self._source.function, structure, (), self._plain)
@@ -406,7 +318,7 @@ def jit_in_this_thread(
     return lambda *arguments: compiled(*arguments)[0]
 
 
-def _flat(function: Callable, structure: _Structure) -> Callable:
+def _flat(function: Callable, structure: Structure) -> Callable:
     """The function of the numbers alone."""
 
     @wraps(function)
@@ -445,13 +357,13 @@ def _refuse_fork() -> None:
 
 
 @lru_cache(maxsize=64)
-def _as_part(function: Callable, structure: _Structure) -> Callable:
+def _as_part(function: Callable, structure: Structure) -> Callable:
     return jax.jit(_flat(function, structure))
 
 
 @lru_cache(maxsize=2 * MOST)
 def _remembered(
-    function: Callable, structure: _Structure, settings: tuple, off: Trick
+    function: Callable, structure: Structure, settings: tuple, off: Trick
 ) -> dict[str, Any]:
     """What is remembered of a program."""
     return {}
