@@ -3,9 +3,9 @@
     sphinx-build -W --keep-going -b html docs docs/_build/html
 
 The pages read well without the site, too: a `python` block is followed by a `text` block
-with what it prints. `prepare` makes cells of the first, which the build executes, and
-leaves out the second. What stands between `<!--` and `-->` on a line of its own may ask
-for a part that the build makes:
+with what it prints. `prepare` makes cells of the first, which the build executes;
+`check_outputs` compares what they print with the second. What stands between `<!--` and
+`-->` on a line of its own may ask for a part that the build makes:
 
     members of: MODULE     the public names of a module, from the docstrings
     help of: jaxro         what every command prints with --help
@@ -22,8 +22,12 @@ HERE = Path(__file__).parent
 os.environ["JAXRO_QUIET"] = "1"  # pages show what their code prints, and no more
 sys.path.insert(0, str(HERE))
 
+from docutils import nodes  # noqa: E402
 from pygments.lexers.special import TextLexer  # noqa: E402
 from reference import describe_commands, describe_members, to_rest  # noqa: E402
+from sphinx.util import logging  # noqa: E402
+
+logger = logging.getLogger(__name__)
 
 project = "jaxro"
 author = "The jaxro authors"
@@ -62,9 +66,13 @@ FIGURES = """```{code-cell}
 ```
 
 """
-CELL = re.compile(r"^```python\n(.*?)^```\n(?:\n*^```text\n.*?^```\n)?", re.M | re.S)
+CELL = re.compile(
+    r"^```python\n(.*?)^```\n(?:\n*^```text\n(.*?)^```\n)?", re.MULTILINE | re.DOTALL
+)
 PART = re.compile(r"^<!-- (members|help|text) of: (\S+) -->$", re.M)
 OUTSIDE = re.compile(r"\[([^]]*)\]\(\.\./(?!README|CONTRIBUTING)[^)]*\)")
+SHOWN: dict[str, list[str]] = {}
+"""What the blocks of each page print, as it is shown there."""
 TEXTS = {"README.md": "readme.md", "CONTRIBUTING.md": "contributing.md"}
 
 
@@ -74,6 +82,32 @@ def to_notebook(text: str) -> str:
     if cells == text:
         return text
     return HEADER + (FIGURES if "plots" in text else "") + cells
+
+
+def to_lines(text: str) -> list[str]:
+    """Without trailing blanks and empty lines at the ends."""
+    return [line.rstrip() for line in text.strip("\n").splitlines()]
+
+
+def check_outputs(app, doctree) -> None:
+    """A warning, which ends a build with -W, for each cell that prints something else
+    than its page shows."""
+    cells = [
+        part
+        for part in doctree.findall(nodes.container)
+        if part.get("nb_element") == "cell_code"
+    ]
+    for cell, expected in zip(cells, SHOWN[app.env.docname], strict=True):
+        blocks = cell.findall(nodes.literal_block)
+        streams = [block for block in blocks if "stream" in block["classes"]]
+        printed = "\n".join(block.astext() for block in streams)
+        if to_lines(printed) != to_lines(expected):
+            logger.warning(
+                "a cell prints:\n%s\nwhere its page shows:\n%s",
+                printed,
+                expected,
+                location=cell,
+            )
 
 
 def fill(text: str) -> str:
@@ -95,6 +129,7 @@ def prepare(app, page: str, source: list[str]) -> None:
     for name, of_site in TEXTS.items():
         text = re.sub(rf"\]\((?:\.\./)?{name}", f"]({of_site}", text)
     text = OUTSIDE.sub(r"\1", text)
+    SHOWN[page] = [output for _, output in CELL.findall(text)]
     source[0] = to_notebook(text)
 
 
@@ -108,4 +143,5 @@ def setup(app) -> None:
     for language in ("csv", "layout"):
         app.add_lexer(language, TextLexer)
     app.connect("source-read", prepare)
+    app.connect("doctree-read", check_outputs)
     app.connect("autodoc-process-docstring", render_docstring)

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -16,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 pytest.importorskip("sphinx", reason="the site needs pip install 'jaxro[docs]'")
 pytest.importorskip("myst_nb", reason="the site needs pip install 'jaxro[docs]'")
+nodes = pytest.importorskip("docutils.nodes")
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +89,27 @@ def test_pictures_are_shown_where_a_page_draws(site):
     drawing = "```python\nplots.figure_of(axes)\n```\n"
     assert "%matplotlib inline" in shown("page", drawing, site)
     assert "%matplotlib inline" not in shown("page", PAGE, site)
+
+
+def test_cell_that_prints_something_else_than_its_page_shows_is_told(site, caplog):
+    shown("page", PAGE, site)
+    app = SimpleNamespace(env=SimpleNamespace(docname="page"))
+
+    def read(*printed: str):
+        page = nodes.document(None, None)
+        for text in printed:
+            cell = nodes.container(nb_element="cell_code")
+            cell += nodes.literal_block(text, text, classes=["output", "stream"])
+            page += cell
+        site[0].check_outputs(app, page)
+
+    read("1\n", "")
+    assert not caplog.records
+    read("2\n", "")
+    (told,) = caplog.records
+    assert "a cell prints:\n2" in told.getMessage()
+    with pytest.raises(ValueError, match="zip"):
+        read("1\n")
 
 
 def test_every_page_stands_in_the_contents():
@@ -172,8 +195,8 @@ def test_docstrings_are_text(site):
 
 @pytest.mark.slow
 def test_site_builds_without_warnings(tmp_path):
-    """Links, contents and reference. The cells are not executed here: the test of the
-    README runs the same blocks."""
+    """Links, contents and reference. The cells are not executed here: `.ci/run` builds the
+    site with them."""
     options = ["nb_execution_mode=off", "suppress_warnings=myst-nb.lexer"]
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
     for option in options:

@@ -98,8 +98,15 @@ def command_line():
     return app, typer.main.get_command(app), testing.CliRunner
 
 
-@pytest.mark.parametrize("document", OF_PYTHON)
+@pytest.mark.parametrize(
+    "document",
+    [
+        pytest.param(name, marks=() if name == "README.md" else pytest.mark.slow)
+        for name in OF_PYTHON
+    ],
+)
 def test_python_blocks_run_and_print_what_they_show(document, capsys):
+    """The build of the site holds the pages of docs/ to the same."""
     names: dict = {}
     shown = 0
     blocks = BLOCKS[document]
