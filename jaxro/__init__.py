@@ -86,6 +86,7 @@ from .orientation.orient import orient as orient
 from .orientation.result import Orientation as Orientation
 from .orientation.results import RESULTS as RESULTS, is_usable as is_usable
 from .xla.notices import announce as announce
+from .xla.settings import compiler_options as compiler_options
 from .xla.store import keep_programs as keep_programs
 
 __version__ = "0.1.0"

@@ -84,6 +84,22 @@ def compiled(
     return Compiled(function, settings, kernel, static, unit)
 
 
+def traced_once(function: Callable) -> Callable:
+    """The function as a part of programs: a decorator for what is large and stands in
+    many of them. JAX traces it once for each structure of its arguments, which are those
+    of `compiled`, and not again in each program."""
+
+    @wraps(function)
+    def call(*data: PyTree, **options: Any) -> Any:
+        try:
+            numbers, structure = divide(data, options, {})
+        except Unknown:
+            return function(*data, **options)
+        return _as_part(function, structure)(*numbers)
+
+    return call
+
+
 class Compiled:
     """A function that runs as a program; see `compiled`."""
 
@@ -356,7 +372,7 @@ def _refuse_fork() -> None:
         )
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=4 * MOST)
 def _as_part(function: Callable, structure: Structure) -> Callable:
     return jax.jit(_flat(function, structure))
 

@@ -111,6 +111,16 @@ NO_LIBRARY_SUMS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 """No sums by a library, which a kernel cannot call."""
 
 
+def compiler_options() -> dict[str, Any] | None:
+    """Options of `jax.jit` by which a function of single pairs is compiled in half of
+    the time: `jax.jit(function, compiler_options=jaxro.compiler_options())`.
+
+    For derivatives of an orientation, say, whose programs are large. A function of very
+    many pairs runs sooner without. None where the compiler knows none of them.
+    """
+    return known_settings(COMPILE_FAST)
+
+
 def known_settings(settings: dict[str, Any]) -> dict[str, Any] | None:
     """The settings that the compiler knows, as `jax.jit` takes them; those that are
     switched off are left out."""

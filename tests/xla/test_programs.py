@@ -21,7 +21,7 @@ from jaxro.geometry import mock_pairs
 from jaxro.rejection import DataSnooping, Recommended, Reweighting
 from jaxro.xla import programs
 from jaxro.xla.programs import compiled, jit_in_this_thread
-from jaxro.xla.settings import RUN_FAST
+from jaxro.xla.settings import COMPILE_FAST, RUN_FAST
 
 
 class Loss(eqx.Module):
@@ -129,6 +129,25 @@ def test_what_a_function_refers_to_is_never_the_one_of_an_earlier_call(monkeypat
     np.testing.assert_allclose(of(lambda x: -x), [-1.0, -1.0])
 
 
+def test_parts_of_many_programs_are_traced_once():
+    part = programs.traced_once(scaled)
+    x = np.arange(2.0)
+    call = lambda wide, loss: jax.jit(lambda x: part(x, loss=loss) + wide)(x)
+    np.testing.assert_allclose(call(1.0, Loss()), 8 * x + 1)
+    found, again = retraced(lambda: call(2.0, Loss(scale=3.0)))
+    assert not again
+    np.testing.assert_allclose(found, 27 * x + 2)
+    found, again = retraced(lambda: call(2.0, Loss(rounds=1)))
+    assert again
+    np.testing.assert_allclose(found, 2 * x + 2)
+    np.testing.assert_allclose(jax.grad(lambda x: part(x, loss=Loss()))(1.0), 8.0)
+    state = type("State", (), {"factor": 2.0})()  # may be another one at any time
+    of_state = lambda: part(x, loss=Loss(rounds=0), also=lambda x: x * state.factor)
+    np.testing.assert_allclose(of_state(), 2 * x)
+    state.factor = 3.0
+    np.testing.assert_allclose(of_state(), 3 * x)
+
+
 @pytest.fixture(scope="module")
 def compilations():
     """How many programs were compiled so far."""
@@ -181,7 +200,10 @@ def test_a_first_call_is_few_programs(compilations):
     "procedure",
     [
         lambda level, sigma: DataSnooping(level=level, sigma=sigma),
-        lambda level, sigma: Recommended(level=level, sigma=sigma),
+        pytest.param(
+            lambda level, sigma: Recommended(level=level, sigma=sigma),
+            marks=pytest.mark.slow,
+        ),
         lambda level, sigma: Reweighting(Tukey(scale=40 * level), sigma=sigma),
     ],
     ids=["data-snooping", "recommended", "tukey"],
@@ -249,6 +271,7 @@ def test_arrays_of_any_kind(unkept, data):
     )
 
 
+@pytest.mark.slow
 def test_batches_from_two_threads_at_once_are_those_of_kept_programs(request):
     vertical = mock_pairs.mock_pair(mock_pairs.standard_layout(16))
     pairs = jax.vmap(lambda key: mock_pairs.noisy(vertical, key, 0.01))(
@@ -259,6 +282,14 @@ def test_batches_from_two_threads_at_once_are_those_of_kept_programs(request):
     with ThreadPoolExecutor(2) as pool:
         for one in pool.map(jaxro.orient_batch, [pairs] * 4):
             jax.tree.map(np.testing.assert_array_equal, one, kept)
+
+
+def test_functions_of_a_user_may_be_compiled_sooner():
+    options = jaxro.compiler_options()
+    x = np.linspace(0.0, 1.0, 7)
+    sooner = jax.jit(lambda x: jnp.sin(x), compiler_options=options)
+    np.testing.assert_allclose(sooner(x), np.sin(x))
+    assert options is None or set(options) <= set(COMPILE_FAST)
 
 
 def test_where_jax_keeps_programs_it_keeps_these(tmp_path):

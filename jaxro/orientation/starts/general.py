@@ -17,6 +17,7 @@ from ...geometry import rotations as rot
 from ...geometry.coplanarity import common_focal
 from ...geometry.elements import RelativePose, vertical
 from ...geometry.pairs import Pair, mask_unusable, pad
+from ...xla.programs import traced_once
 from ...xla.selection import where_needed
 from .. import degeneracy, planes
 from ..degeneracy import significant
@@ -68,10 +69,15 @@ class General(AbstractStart):
         points = AT_ONCE if jax.default_backend() == "cpu" else ON_DEVICES
         most = max(points // max(pair.x_left.shape[0], 1), 1)
         return where_needed(
-            self._begin, jnp.any(pair.mask), lax.stop_gradient(pair), nothing, most
+            lambda pair: _begin(pair, start=self),
+            jnp.any(pair.mask),
+            lax.stop_gradient(pair),
+            nothing,
+            most,
         )
 
-    def _begin(self, pair: Pair) -> StartingPose:
+    def begin(self, pair: Pair) -> StartingPose:
+        """The pose to begin with, whether it is needed or not."""
         # of no points there are no candidates to choose from
         pair = _accurate(pad(pair, max(pair.x_left.shape[0], 1)))
         best, exist = self._two_best(pair)
@@ -119,6 +125,11 @@ class General(AbstractStart):
         normal_case = jax.tree.map(lambda a: a[None], vertical(pair.focal_left))
         poses = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), poses, normal_case)
         return poses, jnp.concatenate([real, jnp.ones(1, bool)])
+
+
+@traced_once
+def _begin(pair: Pair, *, start: General) -> StartingPose:
+    return start.begin(pair)
 
 
 def _fits_as_well(pair: Pair, first: Inspection, second: Inspection) -> Bool[Array, ""]:
