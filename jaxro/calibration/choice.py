@@ -23,7 +23,7 @@ from ..adjustment import RESULTS, JointAdjustment, symmetric
 from ..xla.passes import count
 from ..xla.programs import compiled
 from .brown import Brown
-from .calibrate import calibrate, first_start, observe
+from .calibrate import by_size, calibrate, first_start, observe
 from .camera import Rays, perspective
 from .field import Field
 from .images import MeasuredImage, frame
@@ -116,7 +116,7 @@ def choose(
     return calibrate(measured, found.best, known), found
 
 
-@compiled(static=("models",))
+@compiled(settings=by_size, static=("models",))
 def _compare(
     measured: MeasuredImage, known: Known, first: Start, *, models: tuple[Model, ...]
 ) -> Figures:

@@ -2,10 +2,13 @@
 known."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..xla.passes import count
+from ..xla.programs import compiled
 
 Places = Float[Array, "point 2"]
 Points = Float[Array, "point 3"]
@@ -46,16 +49,27 @@ def image(
     points that do not lie in a plane tell it, and for a plane object it is taken to be
     so. Raises ValueError for lengths that differ.
     """
-    places = jnp.stack([jnp.asarray(x, float), jnp.asarray(y, float)], axis=-1)
-    points = jnp.asarray(points, float)
-    if points.shape != (len(places), 3):
+    number = np.size(x)
+    as_array = lambda a: a if isinstance(a, jax.Array) else np.asarray(a)
+    if np.shape(points) != (number, 3):
         raise ValueError(
-            f"calibration.image: {len(places)} measured places need as many object "
-            f"points (X, Y, Z), got an array of shape {points.shape}"
+            f"calibration.image: {number} measured places need as many object "
+            f"points (X, Y, Z), got an array of shape {np.shape(points)}"
         )
-    given = jnp.ones(len(places), bool) if mask is None else jnp.asarray(mask)
-    sigma = jnp.broadcast_to(jnp.asarray(sigma, float), places.shape[:1])
-    deviations = jnp.broadcast_to(jnp.asarray(point_sigma, float), points.shape)
+    handedness = 0.0 if y_down is None else 1.0 if y_down else -1.0
+    given = np.ones(number, bool) if mask is None else mask
+    numbers = x, y, points, sigma, point_sigma, handedness
+    return _measure(*map(as_array, (given, *numbers)))
+
+
+@compiled
+def _measure(given: Bool[Array, " point"], *numbers: Array) -> MeasuredImage:
+    """The image, without the points that are not finite."""
+    as_real = (jnp.asarray(a, float) for a in numbers)
+    x, y, points, sigma, point_sigma, handedness = as_real
+    places = jnp.stack([x, y], axis=-1)
+    sigma = jnp.broadcast_to(sigma, places.shape[:1])
+    deviations = jnp.broadcast_to(point_sigma, points.shape)
     finite = jnp.all(jnp.isfinite(places), axis=1) & jnp.all(
         jnp.isfinite(points) & jnp.isfinite(deviations), axis=1
     )
@@ -67,7 +81,7 @@ def image(
         sigma=jnp.where(use, sigma, 1.0),
         point_sigma=used(deviations),
         mask=use,
-        handedness=jnp.asarray(0.0 if y_down is None else 1.0 if y_down else -1.0),
+        handedness=handedness,
     )
 
 

@@ -3,8 +3,9 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from ..xla.programs import compiled
 from .camera import Camera
 from .images import Frame
 from .models import Model
@@ -45,15 +46,18 @@ def known(
     focal_sigma: ArrayLike = 0.0,
 ) -> Known:
     """A principal place and a focal length with standard deviations."""
-    infinite = jnp.full((), jnp.inf, float)
-    at = jnp.zeros(2) if principal is None else jnp.asarray(principal, float)
-    of = infinite if principal is None else jnp.asarray(principal_sigma, float)
-    return Known(
-        at,
-        jnp.broadcast_to(of, (2,)),
-        jnp.asarray(1.0 if focal is None else focal, float),
-        infinite if focal is None else jnp.asarray(focal_sigma, float),
-    )
+    if principal is None:
+        principal, principal_sigma = (0.0, 0.0), np.inf
+    if focal is None:
+        focal, focal_sigma = 1.0, np.inf
+    return _as_known(principal, principal_sigma, focal, focal_sigma)
+
+
+@compiled
+def _as_known(*numbers: PyTree) -> Known:
+    """A place, its deviation or two of them, a length and its deviation as arrays."""
+    at, of_place, focal, of_focal = (jnp.asarray(a, float) for a in numbers)
+    return Known(at, jnp.broadcast_to(of_place, (2,)), focal, of_focal)
 
 
 def prior(
