@@ -69,7 +69,10 @@ def objective(rho, coordinates, sigma):
 
 @pytest.mark.parametrize(
     "loss",
-    [None, *WRITTEN_OUT],
+    [
+        pytest.param(kind, marks=() if kind is losses.Huber else pytest.mark.slow)
+        for kind in (None, *WRITTEN_OUT)
+    ],
     ids=lambda kind: "squares" if kind is None else kind.__name__,
 )
 def test_orientation_is_the_minimum_of_the_written_out_objective(loss):
@@ -112,7 +115,11 @@ def test_orientation_is_the_minimum_of_the_written_out_objective(loss):
 
 
 @pytest.mark.parametrize(
-    "loss", [losses.Cauchy(scale=0.02), losses.GemanMcClure(scale=0.02)]
+    "loss",
+    [
+        pytest.param(losses.Cauchy(scale=0.02), marks=pytest.mark.slow),
+        losses.GemanMcClure(scale=0.02),
+    ],
 )
 def test_slow_steps_are_gone_to_their_end(loss):
     """Reweighted steps fall by a tenth only where many points are let go: beginning

@@ -56,6 +56,7 @@ def held(count, points, loss, wrong=0.0):
     return np.mean(np.sqrt(np.mean(errors**2, axis=0) / promised)), np.mean(inside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loss",
     [losses.Huber(), losses.GemanMcClure()],

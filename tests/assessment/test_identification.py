@@ -172,7 +172,8 @@ def test_where_nothing_tells_the_points_apart_none_is_rejected():
     assert np.all(six.undecided[:6]) and np.all(six.mask[:6])
 
 
-@pytest.mark.parametrize("trials", [512, pytest.param(8192, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("trials", [512, 8192])
 def test_of_eight_points_no_good_one_is_rejected_alone(trials):
     """One error of 4 to 12 sigma: the wrong point is among those named."""
     detections = hits = 0
@@ -194,6 +195,7 @@ def test_sixteen_points_are_decided():
         assert np.mean(right) > today - 0.005, (size, np.mean(right))
 
 
+@pytest.mark.slow
 def test_a_verdict_is_doubted_as_the_search_would_have_been():
     """Of the pair without the point that went as of the pair with it; both to first
     order."""

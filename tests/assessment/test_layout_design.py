@@ -101,6 +101,7 @@ def test_six_points_go_to_the_standard_zones(criterion):
     np.testing.assert_allclose(places, ZONES[np.lexsort(ZONES.T)], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_two_more_points():
     """With the six kept the best two more lie in two outer zones, and the ellipsoid
     shrinks by an eighth."""
@@ -115,6 +116,7 @@ def test_two_more_points():
     )
 
 
+@pytest.mark.slow
 def test_reliability_wants_no_standard_zones():
     """Redundancy numbers add up to n - 5, so that in vertical photos the largest
     minimal detectable error is at least delta0 sigma sqrt(2n/(n - 5)). The design
@@ -126,9 +128,10 @@ def test_reliability_wants_no_standard_zones():
     np.testing.assert_allclose(zones, np.sqrt(2) * bound, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "criterion",
-    [CRITERIA[2], pytest.param(CRITERIA[3], marks=pytest.mark.slow)],
+    CRITERIA[2:4],
     ids=lambda c: type(c).__name__,
 )
 def test_never_worse_than_the_start(criterion):
@@ -232,9 +235,10 @@ def test_an_error_of_the_detectable_size_moves_its_test_by_delta0():
     np.testing.assert_allclose(tested(errors[3], jnp.arange(9)), DELTA0, rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trials", "within"),
-    [(4000, 0.045), pytest.param(20_000, 0.02, marks=pytest.mark.slow)],
+    [(4000, 0.045), (20_000, 0.02)],
 )
 def test_heights_deviate_as_simulated(trials, within):
     """Standard deviations of model heights, to four standard errors."""

@@ -574,6 +574,7 @@ def calibrated(layout: str, position: str, count: int, exact: bool) -> dict[str,
     return report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("layout", "position"), [("ten", "near vertical")])
 def test_promises_are_kept(layout, position):
     calibrated(layout, position, 2_000, exact=False)

@@ -151,6 +151,7 @@ def test_derivatives_are_those_of_the_nonlinear_adjustment():
             )
 
 
+@pytest.mark.slow
 def test_forward_equals_reverse():
     """Of a random sum of results, which is one number, derivatives go backwards; of all
     results, forwards. (Those of the heights go backwards in the error budget.)"""
@@ -197,6 +198,7 @@ def test_unusable_orientations_have_no_derivative():
     )
 
 
+@pytest.mark.slow
 def test_steps_that_do_not_suffice_are_told():
     pair = photographed(block(), turn=(0.1, -0.1, 0.1), sigma=0.01)
     options = {"start": starts.Vertical(), "max_steps": 2}
@@ -396,9 +398,10 @@ def test_error_budget_is_made_of_the_derivatives():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trials", "within"),
-    [(4000, 0.045), pytest.param(20_000, 0.02, marks=pytest.mark.slow)],
+    [(4000, 0.045), (20_000, 0.02)],
 )
 def test_propagation_equals_simulation(trials, within):
     """Standard deviations of elements and heights of simulated pairs, to four standard
@@ -426,6 +429,7 @@ def test_propagation_equals_simulation(trials, within):
     np.testing.assert_allclose(np.sqrt(coordinates), heights, rtol=within)
 
 
+@pytest.mark.slow
 def test_influence_and_leave_one_out():
     """Dewitt's six points: the refits are exact solutions of five conditions. With five
     points none can be left out."""

@@ -81,6 +81,7 @@ def within_two(found, truth):
         )
 
 
+@pytest.mark.slow
 def test_steps_do_not_run_in_a_circle():
     """Three classes 1 : 3 : 9 in thirty pairs, where the first steps make the small
     variance negative."""
@@ -94,6 +95,7 @@ def test_steps_do_not_run_in_a_circle():
     assert 0.7 < np.sqrt(np.mean(off**2)) < 1.7 and np.all(np.abs(off) < 6)
 
 
+@pytest.mark.slow
 def test_classes_of_points_in_near_vertical_pairs():
     pairs, found = batch(NEAR, "by class")
     groups = (CLASSES.astype(int),) * 4

@@ -112,6 +112,7 @@ def test_a_base_that_is_no_length_gives_no_elements():
     )
 
 
+@pytest.mark.slow
 def test_no_points_at_all():
     assert name(jaxro.orient(jaxro.pair([], [], [], [], focal=1.0))) == "too_few_points"
 
@@ -206,6 +207,7 @@ def test_a_pair_keeps_its_numbers_whatever_becomes_of_the_arrays_it_was_made_of(
         jaxro.Camera(focal=-1.0)
 
 
+@pytest.mark.slow
 def test_failed_pairs_leave_the_derivatives_of_their_neighbours_finite():
     """By a number that all pairs share; what has failed is selected away."""
     good = photographed(block(8), turn=(0.01, 0.02, -0.01), sigma=0.01)

@@ -106,7 +106,8 @@ def test_more_points_than_a_chunk_holds():
 OTHERS = {"threads": 1, "chunk": 16, "elements": DependentElements, "base": 1.0}
 
 
-@pytest.mark.parametrize("options", [{}, pytest.param(OTHERS, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, OTHERS])
 def test_batch_equals_vmap(pairs, loop, options):
     batch = jaxro.orient_batch(pairs, **options)
     single = {k: v for k, v in options.items() if k in ("elements", "base")}
@@ -126,6 +127,7 @@ def test_batch_equals_vmap(pairs, loop, options):
         np.testing.assert_allclose(one, other, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_any_chunk_will_do(pairs, near, loop):
     few = lambda pairs: jax.tree.map(lambda a: a[:7], pairs)
     found = jaxro.orient_batch(few(pairs), select=_sigma0, chunk=3)
@@ -157,18 +159,21 @@ def _sigma0(orientation):
     return orientation.sigma0
 
 
-def test_programs_of_functions_without_a_name_are_not_kept(near, tmp_path):
-    """A lambda cannot be found again on disk: it is compiled, and nothing is
-    written."""
+def test_programs_of_functions_without_a_name_are_told_apart(near, tmp_path):
+    """A kept program of a lambda is known by what it computes."""
     few = jax.tree.map(lambda a: a[:7], near)
+    reads = lambda o: o.sigma0, lambda o: o.m_q, lambda o: o.sigma0
     store.use(tmp_path)
     try:
-        np.testing.assert_array_equal(
-            jaxro.orient_batch(few, select=lambda o: o.sigma0, chunk=3).shape, (7,)
+        first, other, again = (
+            jaxro.orient_batch(few, select=read, chunk=3) for read in reads
         )
     finally:
         store.use(None)
-    assert not list(tmp_path.iterdir())
+    np.testing.assert_array_equal(again, first)
+    whole = jaxro.orient_batch(few, chunk=3)
+    np.testing.assert_allclose(first, whole.sigma0, rtol=1e-10)
+    np.testing.assert_allclose(other, whole.m_q, rtol=1e-10)
 
 
 def test_only_what_is_selected_and_progress(near, whole):
@@ -207,6 +212,7 @@ def without_kernel():
     return jax.tree.map(np.asarray, program(few, **EVERYTHING))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", [one_kernel, one_kernel_fusing_points])
 def test_one_kernel_gives_what_many_give(pairs, kernel):
     few = jax.tree.map(lambda a: a[:96], pairs)
@@ -235,6 +241,7 @@ def test_one_kernel_gives_what_many_give(pairs, kernel):
             )
 
 
+@pytest.mark.slow
 def test_results_of_points_are_one_loop_each():
     """A reduction with the two results of the adjustment and one with the six of the
     oriented pair. If their calls were not marked any more, they would be inlined, read
@@ -287,6 +294,7 @@ def derivative(pairs):
     return problems.jit(jax.grad(total, allow_int=True)).lower(pairs).compile()
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_batch_are_differences(pairs, loop, derivative):
     """Of pairs in any position among near-vertical ones, by the fourth point."""
     gradient = np.asarray(derivative(pairs).y_left[:, 3])
@@ -478,6 +486,7 @@ def test_any_function_of_a_pair(pairs):
     assert seen[-1] == (len(pairs.x_left),) * 2
 
 
+@pytest.mark.slow
 def test_a_batch_is_read_as_each_of_its_pairs(pairs, loop):
     """Whatever is made of a pair and its orientation, those from the vertical and those
     from the general start; what is derived from a reading, in NumPy as in JAX."""

@@ -74,7 +74,9 @@ def test_ragged_equals_one_by_one(pairs, together):
                 )
 
 
-@pytest.mark.parametrize(("length", "size"), [(8, 8), (7, 8), (8, 12)])
+@pytest.mark.parametrize(
+    ("length", "size"), [(8, 8), (7, 8), pytest.param(8, 12, marks=pytest.mark.slow)]
+)
 def test_pairs_of_one_length(pairs, length, size):
     """One of them in any position; where they have the size of a batch there is nothing
     to put in order."""

@@ -107,6 +107,7 @@ def test_no_datum_changes_what_the_network_says_of_itself():
         np.testing.assert_allclose(ratio(two), ratio(one), rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3])
 def test_a_short_strip_with_wrong_ties_comes_to_rest(seed):
     """Four models, from their pairs, without anything known of the ground: centres

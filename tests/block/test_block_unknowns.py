@@ -34,6 +34,7 @@ def other_camera(measured):
     return measured._replace(x=x * radial + x0, y=y * radial + y0)
 
 
+@pytest.mark.slow
 def test_inner_parameters_are_true_within_their_deviations():
     """So are the points; with the camera that was given sigma0 tells."""
     z = []
@@ -106,6 +107,7 @@ def test_known_stations_are_those_of_a_dense_adjustment():
     assert 0.5 < np.sqrt(np.nanmean(off**2)) < 1.6
 
 
+@pytest.mark.slow
 def test_a_block_is_placed_by_its_stations_alone():
     """From the pairs, one station wrong by 30 m."""
     mock = SMALL
@@ -123,6 +125,7 @@ def test_a_block_is_placed_by_its_stations_alone():
     assert off[7, 0] == pytest.approx(-30, abs=0.5)
 
 
+@pytest.mark.slow
 def test_variance_components_find_what_was_stated_wrong():
     """Places with twice their deviation, control with a quarter of it."""
     factors, z = [], []

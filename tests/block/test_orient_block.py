@@ -146,7 +146,7 @@ def test_from_pairs_in_any_order_to_the_truth(flight):
     assert np.sum(oriented.wrong.rays) <= 2
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2])
+@pytest.mark.parametrize("share", [pytest.param(0.05, marks=pytest.mark.slow), 0.2])
 def test_wrong_ties_are_found(share):
     """From the pairs alone."""
     mock = block.mock_block(3, block.Flight(strips=3, models=8))
@@ -184,6 +184,7 @@ def test_swapped_names_of_control_are_found_before_the_adjustment():
     assert np.flatnonzero(placed.wrong).tolist() == [1, 6]
 
 
+@pytest.mark.slow
 def test_parts_without_a_common_scale_are_refused():
     """Points in the middle of a strip are on two photos at most."""
     mock = block.mock_block(5, block.Flight(models=10))
@@ -224,7 +225,7 @@ def test_control_on_a_line_is_refused():
         block.place(measured._replace(x=x, y=y), chained, known)
 
 
-@pytest.mark.parametrize("models", [3, 8])
+@pytest.mark.parametrize("models", [3, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_free_network_determines_all_but_its_datum(models):
     """Four photos, and nine, for which there is no exact room."""
     mock = block.mock_block(7, block.Flight(models=models))

@@ -16,7 +16,12 @@ def rays_of(stations, points, image, point):
 
 
 @pytest.mark.parametrize(
-    ("depth", "focal_sigma"), [(0.0, np.inf), (2.0, np.inf), (2.0, 0.02)]
+    ("depth", "focal_sigma"),
+    [
+        (0.0, np.inf),
+        pytest.param(2.0, np.inf, marks=pytest.mark.slow),
+        pytest.param(2.0, 0.02, marks=pytest.mark.slow),
+    ],
 )
 def test_stations_and_points_are_those_of_a_dense_adjustment(depth, focal_sigma):
     """Of a plane field of targets and of a solid one; six points are known, and the
@@ -109,6 +114,7 @@ def test_a_free_network_has_the_inner_geometry_of_any_datum():
     assert np.all(found.centre_deviations < held.centre_deviations)
 
 
+@pytest.mark.slow
 def test_variance_components_of_places_and_known_points():
     """Places are twice as good as was said, control points three times as bad."""
     rng = np.random.default_rng(7)

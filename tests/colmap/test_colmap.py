@@ -355,6 +355,7 @@ def test_every_pair_gets_what_it_is_worth(tmp_path):
         assert np.sqrt(np.mean(off**2)) < 2 * NOISE, name
 
 
+@pytest.mark.slow
 def test_poses_and_matches_are_those_of_recommended(tmp_path):
     """Photos in any position, a fifth to three fifths of 60 to 200 matches wrong;
     matches of photos that have nothing in common have no consensus in both."""

@@ -39,6 +39,7 @@ def verdicts(tmp_path_factory):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", databases.FISHEYES)
 def test_matches_of_a_fisheye(verdicts, model):
     ours, _, summary = verdicts[model]

@@ -100,6 +100,7 @@ def test_a_wrong_control_point_is_named(tables):
     assert "as large as the standard deviations say" in words(told.stdout)
 
 
+@pytest.mark.slow
 def test_exchanged_names_are_found(tables):
     """They draw the model so far that it is refused, and no residual tells which."""
     exchange = {"1": "8", "8": "1"}

@@ -108,6 +108,7 @@ def edited(path, edit):
     path.write_text("\n".join(map(",".join, kept)) + "\n")
 
 
+@pytest.mark.slow
 def test_sigma_is_found_where_none_is_given(tables):
     told = block(tables, sigma=None)
     assert told.exit_code == 0
@@ -129,6 +130,7 @@ def test_a_wrong_control_point_is_named(tables, tmp_path):
     assert row["left_out"] == "true" and float(row["vZ"]) == pytest.approx(-8, abs=1)
 
 
+@pytest.mark.slow
 def test_control_in_plan_and_in_height_alone(tables):
     """No point has all three coordinates."""
 
@@ -160,6 +162,7 @@ def test_a_control_point_on_one_photo_counts(tables, written, tmp_path):
     assert found["points"] == plain["points"] + 1
 
 
+@pytest.mark.slow
 def test_stations_inner_parameters_and_components(tables, written, tmp_path):
     """Stations are rows of the ground with this role; a wrong focal length is found."""
     plain = json.loads((written / "summary.json").read_text())
@@ -188,6 +191,7 @@ def test_stations_inner_parameters_and_components(tables, written, tmp_path):
     assert set(summary["components"]) == {"places", "control", "stations"}
 
 
+@pytest.mark.slow
 def test_other_ways_are_told_beside_it(tables):
     """By conditions the solution is the same; classical models are less accurate."""
     told = block(tables, "--conditions", "--classical")
@@ -206,6 +210,7 @@ def test_other_ways_are_told_beside_it(tables):
     assert refused.exit_code == 2 and "--conditions" in refused.stderr
 
 
+@pytest.mark.slow
 def test_scale_bars_without_control(tables, tmp_path):
     ground = {row["point"]: row for row in rows(tables[1])}
     at = {name: numbers([row], *AXES)[0] for name, row in ground.items()}

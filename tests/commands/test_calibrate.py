@@ -121,9 +121,8 @@ def test_the_example_needs_a_field(tmp_path):
     assert tried[0]["score_behind_best"] == "0.0"
 
 
-@pytest.mark.parametrize(
-    ("film", "model"), [(0.0, "one-f"), pytest.param(0.2, None, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("film", "model"), [(0.0, "one-f"), (0.2, None)])
 def test_from_raw_coordinates_to_a_model_in_three_commands(film, model, tmp_path):
     """The wrong point is found, and the others are where they are."""
     control, new, known = files(tmp_path, film)

@@ -160,6 +160,7 @@ def table_1(points):
     ]
 
 
+@pytest.mark.slow
 def test_many_pairs_keep_their_rows_in_order_and_say_what_is_left_to_do(tmp_path):
     example = [line.rsplit(",", 1)[0] for line in mock_example.TABLE.split()[1:]]
     pairs = {"good": example, "[four]": example[:4], "1971": table_1(10)}
@@ -322,6 +323,7 @@ def test_every_outcome_has_a_name_and_advice():
     )
 
 
+@pytest.mark.slow
 def test_points_that_nothing_tells_apart_are_named(tmp_path):
     """An error in one of four points that stand alone in their zones: in the report,
     the tables and the summary."""

@@ -318,6 +318,7 @@ def test_nothing_is_left_of_a_result_that_could_not_be_written(tmp_path, monkeyp
     )
 
 
+@pytest.mark.slow
 def test_kept_programs_change_nothing_but_the_time(tmp_path):
     def call() -> str:
         command = [sys.executable, "-W", "error", "-m", "jaxro", "orient"]

@@ -95,6 +95,7 @@ def test_a_cleaned_pair_has_all_pictures(example):
     assert {content[:4] for content in made.values()} == {b"\x89PNG"}
 
 
+@pytest.mark.slow
 def test_the_wrong_point_takes_no_part_in_the_model(monkeypatch):
     """And a given base is its scale."""
     options = Options(elements="independent", base=65.0)

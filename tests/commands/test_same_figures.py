@@ -56,7 +56,10 @@ def measure(pairs: int) -> dict[str, list]:
     return columns
 
 
-@pytest.fixture(scope="module", params=COUNTS)
+@pytest.fixture(
+    scope="module",
+    params=["one", pytest.param("few", marks=pytest.mark.slow), "many"],
+)
 def folder(request, tmp_path_factory):
     """The same measurements as table.csv and table.parquet."""
     columns = measure(COUNTS[request.param])

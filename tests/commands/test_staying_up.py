@@ -176,6 +176,7 @@ def test_two_processes_do_not_write_into_one_folder(table, tmp_path):
     assert names(out.parent) == {"out", neighbour.name}
 
 
+@pytest.mark.slow
 def test_two_processes_at_once(table, tmp_path, environment):
     out = tmp_path / "out"
     line = [*COMMAND, "orient", table, *FOCAL, "--out", out]

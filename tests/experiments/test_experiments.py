@@ -87,6 +87,7 @@ def shares():
     return {(s.procedure, s.setting.errors): s for s in found.scores}
 
 
+@pytest.mark.slow
 def test_known_procedures_get_exactly_their_shares(shares):
     expected = {  # found, misnamed, lost, perfect, alarms, unfinished
         ("none", 2): (0, 0, 0, 0, 0, 0),
@@ -151,6 +152,7 @@ def test_trials_have_their_errors_and_the_angle_is_that_of_the_oracle(shares):
     assert math.isnan(shares["all", 2].angle.value)  # no orientation, no angle
 
 
+@pytest.mark.slow
 def test_calibration_finds_the_limit_of_a_known_distribution():
     clean, wrong = compare.simulate(EXACT, Setting("rows", 0, 0.0), 2000, 3)
     assert not wrong.any()
@@ -406,6 +408,7 @@ def paper_1989():
     return burshtynskaya1989.run()
 
 
+@pytest.mark.slow
 def test_one_tolerance_reproduces_all_three_described_pairs_of_1989(paper_1989):
     """II-13: 14 and 16 go, III-7: 15, II-9: 7, for eps4 in (.0405, .0464] mm; with the
     other layout for none."""

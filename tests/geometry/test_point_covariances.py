@@ -255,6 +255,7 @@ def many():
     return [*pairs, eqx.tree_at(lambda p: p.roots, pairs[0], None)]
 
 
+@pytest.mark.slow
 def test_batches_and_ragged_pairs_are_those_of_orient(many):
     single = np.array([float(orient(one).sigma0) for one in many])
     batch = jaxro.stack(many, 32)
@@ -318,7 +319,10 @@ def with_wrong():
 
 @pytest.mark.parametrize(
     "procedure",
-    [rejection.Recommended(), rejection.DataSnooping()],
+    [
+        pytest.param(rejection.Recommended(), marks=pytest.mark.slow),
+        rejection.DataSnooping(),
+    ],
     ids=["recommended", "data snooping"],
 )
 def test_cleaning_finds_errors_that_only_covariances_show(procedure, with_wrong):
@@ -326,6 +330,7 @@ def test_cleaning_finds_errors_that_only_covariances_show(procedure, with_wrong)
     np.testing.assert_array_equal(np.asarray(procedure(pair).mask), ~wrong)
 
 
+@pytest.mark.slow
 def test_one_sigma_for_all_hides_these_errors(with_wrong):
     pair, _ = with_wrong
     plain = eqx.tree_at(lambda p: p.roots, pair, None)
@@ -361,6 +366,7 @@ def test_what_cannot_use_covariances_refuses(pair, oriented):
         jaxro.variance_components.by_photo(batch, both)
 
 
+@pytest.mark.slow
 def test_parallax_residuals_are_those_of_sigma_alone(pair):
     """The parallax is taken as measured itself: covariances of coordinates play no
     part."""

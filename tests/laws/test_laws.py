@@ -34,7 +34,7 @@ every_kind = pytest.mark.parametrize(
     ("system", "residual"),
     [
         *((system, coplanarity.rigorous) for system in problems.SYSTEMS),
-        (IndependentElements, coplanarity.parallax),
+        pytest.param(IndependentElements, coplanarity.parallax, marks=pytest.mark.slow),
     ],
     ids=lambda kind: kind.__name__,
 )
@@ -42,15 +42,18 @@ heavy_kind = pytest.mark.parametrize(
     ("system", "residual"),
     [
         (RelativePose, coplanarity.rigorous),
-        (IndependentElements, coplanarity.parallax),
         *(
-            pytest.param(system, coplanarity.rigorous, marks=pytest.mark.slow)
-            for system in (IndependentElements, DependentElements)
+            pytest.param(*kind, marks=pytest.mark.slow)
+            for kind in (
+                (IndependentElements, coplanarity.parallax),
+                (IndependentElements, coplanarity.rigorous),
+                (DependentElements, coplanarity.rigorous),
+            )
         ),
     ],
     ids=lambda kind: kind.__name__,
 )
-"""The same, half of them left out where each compiles programs of its own."""
+"""The same, most of them left out where each compiles programs of its own."""
 
 
 every_case = pytest.mark.parametrize(
@@ -441,11 +444,10 @@ def spoiled(measured):
 @pytest.mark.parametrize(
     ("system", "start"),
     [
-        (RelativePose, starts.Auto()),
         (DependentElements, starts.Vertical()),
         *(
             pytest.param(system, starts.Auto(), marks=pytest.mark.slow)
-            for system in (DependentElements, IndependentElements)
+            for system in (RelativePose, DependentElements, IndependentElements)
         ),
     ],
     ids=lambda kind: getattr(kind, "__name__", type(kind).__name__),
@@ -489,6 +491,7 @@ def test_failures_leave_their_neighbours_gradients_alone():
     np.testing.assert_array_equal(clean[:, 1::2], spoilt[:, 1::2])
 
 
+@pytest.mark.slow
 def test_cofactors_do_not_depend_on_which_way_the_base_was_found():
     """The right photo on the left: from the vertical the base is found the wrong way
     round, and turned."""
@@ -511,6 +514,7 @@ def test_cofactors_do_not_depend_on_which_way_the_base_was_found():
     )
 
 
+@pytest.mark.slow
 def test_a_known_start_does_not_change_what_is_given():
     """Elements, their deviations and the model have one scale: that of the base given,
     or of the start."""

@@ -57,12 +57,11 @@ VERTICAL = jaxro.starts.Vertical()
 @pytest.mark.parametrize(
     ("points", "start"),
     [
-        (9, jaxro.starts.Auto()),
         (5, VERTICAL),
         (37, VERTICAL),
         *(
             pytest.param(n, jaxro.starts.Auto(), marks=pytest.mark.slow)
-            for n in (3, 13, 16)
+            for n in (3, 9, 13, 16)
         ),
     ],
 )
@@ -93,6 +92,7 @@ def test_a_length_that_is_new_compiles_nothing():
     assert not programs
 
 
+@pytest.mark.slow
 def test_transformations_without_jit_compile_once():
     pair = near_vertical(12)
     batch = jax.tree.map(lambda a: jnp.stack([a, a]), pair)

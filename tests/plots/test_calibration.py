@@ -46,6 +46,7 @@ def contours(axes):
     return [path.vertices for one in sets for path in one.get_paths()]
 
 
+@pytest.mark.slow
 def test_borders_of_strips_stand_where_the_zones_change(plain):
     """Columns of unequal width, and two rows: lines at their borders within the measured
     area, which is the rectangle around the places."""
@@ -63,6 +64,7 @@ def test_borders_of_strips_stand_where_the_zones_change(plain):
     assert np.all(on_a_border | (np.abs(part[:, 1] - 0.5) < 1e-6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 2])
 def test_rings_are_circles_about_the_principal_place(plain, degree):
     found, places = with_zones(plain, x=calibration.rings(2, degree))

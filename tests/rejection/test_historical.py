@@ -378,6 +378,7 @@ def clean(count, seed):
     )
 
 
+@pytest.mark.slow
 def test_grubbs_formula_rejects_a_good_point_of_nearly_every_second_pair():
     """At a nominal 5 %, since the means of 1989 are no normal sample: 42.8 % of 40,000
     pairs of 16 points."""

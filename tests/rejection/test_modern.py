@@ -125,14 +125,11 @@ def differing(mask, expected):
     return np.mean(np.any(mask != np.array(expected), axis=1))
 
 
-OFTEN = losses.Huber, losses.IggThree
-
-
 @pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "function",
     [
-        f if isinstance(f, OFTEN) else pytest.param(f, marks=pytest.mark.slow)
+        f if isinstance(f, losses.Huber) else pytest.param(f, marks=pytest.mark.slow)
         for f in WEIGHTS
     ],
     ids=lambda function: type(function).__name__,
@@ -156,6 +153,7 @@ def test_reweighting_ends_where_numpy_does(function, count):
     np.testing.assert_array_equal(found.statistic > 3.29, ~mask)
 
 
+@pytest.mark.slow
 def test_reweighting_that_does_not_rest_is_told():
     measured, _ = contaminated(60)
     few, enough = (
@@ -166,7 +164,11 @@ def test_reweighting_that_does_not_rest_is_told():
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("estimated", [False, True], ids=["w", "tau"])
+@pytest.mark.parametrize(
+    "estimated",
+    [False, pytest.param(True, marks=pytest.mark.slow)],
+    ids=["w", "tau"],
+)
 def test_data_snooping_is_that_of_numpy(estimated, count):
     measured, wrong = contaminated(count)
     found = decided(DataSnooping(level=0.01, estimated=estimated), measured)
@@ -196,6 +198,7 @@ def test_all_subsets_finds_the_fewest_omissions_that_fit():
         assert tuple(np.flatnonzero(~kept)) == (best or ())
 
 
+@pytest.mark.slow
 def test_no_choice_of_omissions_is_told():
     measured, wrong = contaminated(12, 10, most=3, largest=300.0)
     told = ended(decided(AllSubsets(most=1), measured), OUTCOMES.no_choice)
@@ -208,7 +211,7 @@ def test_no_choice_of_omissions_is_told():
     "procedure",
     [
         pytest.param(Ransac(hypotheses=Newton()), marks=pytest.mark.slow),
-        LeastMedian(),
+        pytest.param(LeastMedian(), marks=pytest.mark.slow),
         Reweighting(losses.Huber()),
     ],
 )
@@ -228,7 +231,7 @@ def test_a_pose_that_no_weight_holds_is_not_at_rest():
     assert np.all(ended(found, OUTCOMES.did_not_rest))
 
 
-@pytest.mark.parametrize("points", [8, 12])
+@pytest.mark.parametrize("points", [pytest.param(8, marks=pytest.mark.slow), 12])
 def test_least_median_of_few_points_is_not_the_fit_of_five(points):
     """Without errors: most points stay, and sigma0 is not far below the noise (a
     hundredth of it and less, if the median were that of all points, of which a subset

@@ -72,6 +72,7 @@ def test_without_errors_heights_are_the_truth():
     assert np.max(off["tilted"]) < 0.35 and 1.2 < np.max(off["nearest"]) < 1.4
 
 
+@pytest.mark.slow
 def test_heights_come_back_within_their_standard_deviations(mock, solved, drawn):
     known = np.asarray(mock.survey.known)
     for errors, deviations in zip(drawn, solved.deviations, strict=True):

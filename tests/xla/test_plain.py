@@ -59,7 +59,10 @@ def check(call: Callable[[], object]) -> None:
     "options",
     [
         {"loss": losses.Huber(0.02)},
-        {"elements": jaxro.IndependentElements, "base": 70.0},
+        pytest.param(
+            {"elements": jaxro.IndependentElements, "base": 70.0},
+            marks=pytest.mark.slow,
+        ),
         pytest.param({"elements": jaxro.DependentElements}, marks=pytest.mark.slow),
     ],
     ids=["loss", "independent", "dependent"],
@@ -69,6 +72,7 @@ def test_orient_batch(pairs, options):
     check(lambda: jaxro.orient_batch(pairs, start=vertical, **options))
 
 
+@pytest.mark.slow
 def test_near_vertical_pairs_and_pairs_in_any_position(pairs):
     anywhere, _ = mock_pairs.random_pairs(jax.random.key(1), 2, POINTS)
     noisy = jax.vmap(lambda pair, key: mock_pairs.noisy(pair, key, 0.01))
@@ -86,15 +90,18 @@ def test_one_loop_of_points(pairs, monkeypatch):
 @pytest.mark.parametrize(
     "name",
     [
-        "data-snooping",
         "recommended",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("two-stage", "danish")),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("data-snooping", "two-stage", "danish")
+        ),
     ],
 )
 def test_clean_batch(pairs, name):
     check(lambda: jaxro.clean_batch(pairs, PROCEDURES[name]))
 
 
+@pytest.mark.slow
 def test_map_batch(pairs):
     def assess(pair):
         oriented = jaxro.orient(pair, start=jaxro.starts.Vertical())
@@ -103,6 +110,7 @@ def test_map_batch(pairs):
     check(lambda: jaxro.map_batch(assess, pairs))
 
 
+@pytest.mark.slow
 def test_ragged(pairs):
     """Two sizes, so that two batches overlap in threads of their own."""
     each = jaxro.unstack(pairs)

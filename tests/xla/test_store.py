@@ -121,7 +121,9 @@ def test_what_was_not_used_for_longest_goes(folder, monkeypatch):
     assert 1 <= len(list(folder.glob("*.program"))) <= 2
 
 
-@pytest.mark.parametrize("emptied", ["ours", "of JAX"])
+@pytest.mark.parametrize(
+    "emptied", ["ours", pytest.param("of JAX", marks=pytest.mark.slow)]
+)
 def test_it_works_beside_the_folder_of_jax(tmp_path, emptied):
     """Both keep programs; one of the folders is emptied; every call gives the same."""
     code = """
