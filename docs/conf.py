@@ -66,9 +66,7 @@ FIGURES = """```{code-cell}
 ```
 
 """
-CELL = re.compile(
-    r"^```python\n(.*?)^```\n(?:\n*^```text\n(.*?)^```\n)?", re.MULTILINE | re.DOTALL
-)
+CELL = re.compile(r"^```python\n(.*?)^```\n(?:\n*^```text\n(.*?)^```\n)?", re.M | re.S)
 PART = re.compile(r"^<!-- (members|help|text) of: (\S+) -->$", re.M)
 OUTSIDE = re.compile(r"\[([^]]*)\]\(\.\./(?!README|CONTRIBUTING)[^)]*\)")
 SHOWN: dict[str, list[str]] = {}

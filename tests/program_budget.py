@@ -13,28 +13,28 @@ import pytest
 
 BUDGET = {
     "adjustment": 750,
-    "assessment": 2200,
+    "assessment": 2000,
     "batches": 850,
     "block": 1600,
-    "calibration": 2600,
+    "calibration": 1800,
     "colmap": 200,
-    "commands": 3000,
-    "exchange": 2000,
-    "experiments": 250,
-    "geometry": 750,
+    "commands": 2000,
+    "exchange": 1300,
+    "experiments": 200,
+    "geometry": 600,
     "laws": 400,
     "orientation": 850,
-    "plots": 1700,
-    "published": 250,
-    "rejection": 450,
-    "reports": 1500,
+    "plots": 1100,
+    "published": 200,
+    "rejection": 400,
+    "reports": 900,
     "surveys": 1400,
     "tables": 50,
-    "texts": 2500,
+    "texts": 900,
     "xla": 600,
 }
-"""Programs that the tests of a folder may compile in a whole run: half more than they
-do, because what two files share depends on which process runs them; the examples of the
+"""Programs that the tests of a folder may compile in a whole run: twice what they do,
+because what two files share depends on which process runs them; the examples of the
 command line count for the folder that asks first."""
 
 TESTS = Path(__file__).parent

@@ -51,6 +51,11 @@ def image(
     """
     number = np.size(x)
     as_array = lambda a: a if isinstance(a, jax.Array) else np.asarray(a)
+    if np.shape(y) != np.shape(x):
+        raise ValueError(
+            f"calibration.image: x has shape {np.shape(x)} and y {np.shape(y)}; every "
+            "place needs both"
+        )
     if np.shape(points) != (number, 3):
         raise ValueError(
             f"calibration.image: {number} measured places need as many object "

@@ -17,7 +17,6 @@ rows are those of benchmarks/decisions.md that measure the part.
 | `settings.COMPILE_FAST` | no settings | sooner first calls | quick compile |
 | `settings.WIDE_VECTORS` | no settings | more numbers at once | other settings |
 | `programs.compiled` | `jax.jit` | one program for all numbers | (a cache) |
-| `programs.traced_once` | the function | a large part is traced once | (a cache) |
 | `programs.jit_in_this_thread` | `jax.jit` | shorter calls of one pair | same thread |
 | `slabs.spread` | a loop over parts | all cores, bounded memory | threads |
 | `store` | `jax.jit` | later processes compile nothing | kept on disk |

@@ -75,29 +75,14 @@ def compiled(
     and real numbers in keyword arguments, but for those that are `static`. Works under
     jit, vmap and grad, compiled or not. `kernel`: `kernels.one_kernel` or the like,
     which the compiler may refuse; the program is then compiled without. `unit`: what the
-    first array has along its last axis, which a waiting user is told.
+    first array has along its last axis, which a waiting user is told. Within programs
+    it is a part of them that JAX traces once for all.
     """
     if function is None:
         return lambda function: compiled(
             function, settings=settings, kernel=kernel, static=static, unit=unit
         )
     return Compiled(function, settings, kernel, static, unit)
-
-
-def traced_once(function: Callable) -> Callable:
-    """The function as a part of programs: a decorator for what is large and stands in
-    many of them. JAX traces it once for each structure of its arguments, which are those
-    of `compiled`, and not again in each program."""
-
-    @wraps(function)
-    def call(*data: PyTree, **options: Any) -> Any:
-        try:
-            numbers, structure = divide(data, options, {})
-        except Unknown:
-            return function(*data, **options)
-        return _as_part(function, structure)(*numbers)
-
-    return call
 
 
 class Compiled:

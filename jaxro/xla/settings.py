@@ -112,8 +112,8 @@ NO_LIBRARY_SUMS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
 
 def compiler_options() -> dict[str, Any] | None:
-    """Options of `jax.jit` by which a function of single pairs is compiled in half of
-    the time: `jax.jit(function, compiler_options=jaxro.compiler_options())`.
+    """Options of `jax.jit` by which a function of single pairs is compiled in about half
+    of the time: `jax.jit(function, compiler_options=jaxro.compiler_options())`.
 
     For derivatives of an orientation, say, whose programs are large. A function of very
     many pairs runs sooner without. None where the compiler knows none of them.

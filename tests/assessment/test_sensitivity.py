@@ -429,7 +429,6 @@ def test_propagation_equals_simulation(trials, within):
     np.testing.assert_allclose(np.sqrt(coordinates), heights, rtol=within)
 
 
-@pytest.mark.slow
 def test_influence_and_leave_one_out():
     """Dewitt's six points: the refits are exact solutions of five conditions. With five
     points none can be left out."""

@@ -79,8 +79,13 @@ def oracle(points, places, zones_x, zones_y):
     return residuals, count + (0 if of_y is None else of_y.max() + 1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name == "strips" else pytest.mark.slow)
+        for name in MODELS
+    ],
+)
 def test_station_and_focal_lengths_are_those_of_an_independent_solution(name):
     """Two of the places are not measured: they change nothing."""
     model, *zones = MODELS[name]

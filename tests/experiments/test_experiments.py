@@ -408,7 +408,6 @@ def paper_1989():
     return burshtynskaya1989.run()
 
 
-@pytest.mark.slow
 def test_one_tolerance_reproduces_all_three_described_pairs_of_1989(paper_1989):
     """II-13: 14 and 16 go, III-7: 15, II-9: 7, for eps4 in (.0405, .0464] mm; with the
     other layout for none."""

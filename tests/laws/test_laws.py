@@ -491,7 +491,6 @@ def test_failures_leave_their_neighbours_gradients_alone():
     np.testing.assert_array_equal(clean[:, 1::2], spoilt[:, 1::2])
 
 
-@pytest.mark.slow
 def test_cofactors_do_not_depend_on_which_way_the_base_was_found():
     """The right photo on the left: from the vertical the base is found the wrong way
     round, and turned."""
@@ -514,7 +513,6 @@ def test_cofactors_do_not_depend_on_which_way_the_base_was_found():
     )
 
 
-@pytest.mark.slow
 def test_a_known_start_does_not_change_what_is_given():
     """Elements, their deviations and the model have one scale: that of the base given,
     or of the start."""

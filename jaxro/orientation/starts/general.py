@@ -17,7 +17,7 @@ from ...geometry import rotations as rot
 from ...geometry.coplanarity import common_focal
 from ...geometry.elements import RelativePose, vertical
 from ...geometry.pairs import Pair, mask_unusable, pad
-from ...xla.programs import traced_once
+from ...xla.programs import compiled
 from ...xla.selection import where_needed
 from .. import degeneracy, planes
 from ..degeneracy import significant
@@ -127,8 +127,9 @@ class General(AbstractStart):
         return poses, jnp.concatenate([real, jnp.ones(1, bool)])
 
 
-@traced_once
+@compiled
 def _begin(pair: Pair, *, start: General) -> StartingPose:
+    """`General.begin` as a part of the programs that hold it, traced once for all."""
     return start.begin(pair)
 
 
