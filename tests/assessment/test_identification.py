@@ -208,9 +208,8 @@ def test_a_verdict_is_doubted_as_the_search_would_have_been():
     assert np.mean(np.all(np.asarray(after)[one] == doubted[one], axis=1)) > 0.97
 
 
-@pytest.mark.parametrize(
-    ("points", "trials"), [(16, 2000), pytest.param(16, 10_000, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("points", "trials"), [(16, 2000), (16, 10_000)])
 def test_the_minimal_identifiable_error_is_identified_with_its_power(points, trials):
     """Planted in a point that has a rival, and in one that has hardly any: adjusted and
     judged anew in every pair."""

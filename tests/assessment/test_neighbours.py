@@ -189,6 +189,7 @@ def test_probability_is_that_of_a_simulation():
     np.testing.assert_allclose(found.probability, chance, atol=0.006)
 
 
+@pytest.mark.slow
 def test_padding_and_sigma_change_nothing():
     """Masked points take no part; the probability does not depend on sigma."""
     pair = mock_pairs.noisy(
@@ -249,6 +250,7 @@ def test_correlated_covariance_is_the_scatter(elements):
     np.testing.assert_allclose(plain.growth, 1, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_report_says_it(tmp_path):
     """One pair and a table of three, correlated errors: the sentence, and probability
     and rho in the JSON."""

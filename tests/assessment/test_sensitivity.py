@@ -350,6 +350,7 @@ def spent():
     return jax.tree.map(np.asarray, problems.jit(jax.vmap(one, (None, 0)))(first, used))
 
 
+@pytest.mark.slow
 def test_error_budget_adds_up():
     full = jax.tree.map(lambda a: a[0], spent())
     real = np.arange(PLACES) < POINTS

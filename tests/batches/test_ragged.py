@@ -135,6 +135,7 @@ def test_what_would_leave_results_unwritten_is_refused(together):
         )
 
 
+@pytest.mark.slow
 def test_cleaning_equals_one_by_one(pairs, together):
     procedure = PROCEDURES["worst-point"]
     found = ragged.clean_ragged(together, procedure, plan=PLAN)

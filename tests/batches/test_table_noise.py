@@ -58,7 +58,7 @@ def compared(make, tables: int, pairs: int, points: int, share: float):
 
 
 CASES = [(any_position, 1, 12, 50, 0.3, 0.15)] + [
-    pytest.param(make, 5, 64, points, share, 0.1, marks=pytest.mark.slow)
+    (make, 5, 64, points, share, 0.1)
     for make in (aerial, any_position)
     for points in (16, 50, 200)
     for share in (0.0, 0.3, 0.5)
@@ -66,6 +66,7 @@ CASES = [(any_position, 1, 12, 50, 0.3, 0.15)] + [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "tables", "pairs", "points", "share", "within"), CASES
 )
@@ -156,6 +157,7 @@ def run(*arguments):
     return result
 
 
+@pytest.mark.slow
 def test_auto_on_the_command_line(small, tmp_path):
     """The number taken is told, stands in the summaries, and gives what it gives when
     it is stated; part by part the same, and after a run that was stopped."""

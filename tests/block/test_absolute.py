@@ -256,6 +256,7 @@ def bundle(coordinates, ground, sigma, poses, start):
     return found.x[12:].reshape(size, 3), deviations, found.fun @ found.fun
 
 
+@pytest.mark.slow
 def test_model_of_a_pair_is_the_bundle_of_its_photos():
     """Places and deviations of control and new points, by the covariance that the image
     coordinates and the five elements give the model."""

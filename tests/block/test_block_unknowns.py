@@ -174,6 +174,7 @@ def test_scale_bars_are_those_of_a_dense_update():
     np.testing.assert_allclose(same.bar_redundancy, 1, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_bars_give_a_free_network_its_scale():
     mock = SMALL
     left, right, pairs, points = block.pairs_of(mock.block)

@@ -89,6 +89,7 @@ def slopes(function, x):
     return np.array([(function(x + e) - function(x - e)) / 2 for e in steps]).T
 
 
+@pytest.mark.slow
 def test_true_deviations_are_those_of_planted_errors(strip):
     """Each place and each known coordinate is changed by itself, and everything is
     computed anew, orientations included."""
@@ -117,6 +118,7 @@ def test_true_deviations_are_those_of_planted_errors(strip):
     np.testing.assert_allclose(found.true, np.sqrt(variances), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_what_it_loses_in_a_strip_of_ten():
     """True deviations over those of the rigorous adjustment, claimed over true ones."""
     flight = block.Flight()

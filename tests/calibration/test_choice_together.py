@@ -31,6 +31,7 @@ def survey(seed):
     return points, truth, image, point, places
 
 
+@pytest.mark.slow
 def test_the_linear_problem_tells_the_evidence_of_all_strengths():
     """The scores that the adjustment with one strength predicts for others are those of
     adjustments with these, within a hundredth of what divides them."""
@@ -54,6 +55,7 @@ def test_the_linear_problem_tells_the_evidence_of_all_strengths():
         np.testing.assert_allclose(scores[16], second.figures.score, atol=0.01 * apart)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bent", [True, False])
 def test_a_field_is_chosen_where_there_is_one(bent):
     """With a deformed film the field predicts new places far better than one focal

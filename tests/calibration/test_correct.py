@@ -1,6 +1,7 @@
 """Corrected coordinates are those of an ideal camera, within their deviations."""
 
 import numpy as np
+import pytest
 from oracles_calibration import rotation, scene
 from simulated_image import LENS, SIGMA, TWO, N, image
 
@@ -32,6 +33,7 @@ def test_corrected_coordinates_are_those_of_an_ideal_camera():
     np.testing.assert_allclose(corrected.sigma, found.sigma0 * SIGMA, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_two_corrected_photos_are_a_pair():
     """From raw coordinates of two stretched photos to their relative orientation."""
     rng = np.random.default_rng(3)

@@ -49,6 +49,7 @@ def compared(seed, model, displacement, other=None):
     return difference(*(calibration.calibrate(i, model) for i in images))
 
 
+@pytest.mark.slow
 def test_nothing_differs_but_the_pose():
     """Photos without errors, one refocused."""
     rng = np.random.default_rng(1)

@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import simulated_image
 from oracles_calibration import scene
 from several_images import FEW, SIGMA, photos
@@ -15,6 +16,7 @@ from jaxro.calibration.distortion import distortion_deviations
 from jaxro.calibration.of_image import of_image
 
 
+@pytest.mark.slow
 def test_an_image_of_several_has_their_numbers():
     """Station, camera, deviations and residuals are those of the common adjustment."""
     rng = np.random.default_rng(4)

@@ -80,6 +80,7 @@ def test_stations_and_points_are_those_of_a_dense_adjustment(depth, focal_sigma)
     np.testing.assert_allclose(left.ravel(), -SIGMA * residuals(x)[:-1], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_free_network_has_the_inner_geometry_of_any_datum():
     """Focal length, its standard deviation and sigma0 are those of a dense adjustment
     whose datum is one station and a coordinate of the next; and the stations have the

@@ -48,6 +48,7 @@ def test_matches_of_a_fisheye(verdicts, model):
     assert abs(np.median(summary.sigma0) - 1) < 0.1
 
 
+@pytest.mark.slow
 def test_poses_are_right_as_often_as_those_of_colmap(verdicts):
     """Both are nearly the best estimate, so that they differ only in which pairs lie
     just below and just above a tenth of a degree."""

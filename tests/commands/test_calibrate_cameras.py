@@ -29,6 +29,7 @@ def wide_photo(rng, station, angles):
     return points, places + AT + rng.normal(0, SIGMA, places.shape)
 
 
+@pytest.mark.slow
 def test_a_fisheye_sees_150_degrees(tmp_path):
     """Station and focal length come out within their deviations."""
     station = np.array([10.0, 5.0, 3.0])
@@ -75,6 +76,7 @@ def three_cameras(tmp_path):
     return tables, measured
 
 
+@pytest.mark.slow
 def test_each_image_has_a_camera_of_its_own(three_cameras):
     """The figures are those of Python, and true; what is known of the principal place
     counts for all three."""

@@ -11,6 +11,7 @@ from jaxro.calibration import Model, rectangles
 AT = np.array([100.0, 50.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [0.0, 0.1])
 def test_zones_that_differ_are_told(step, tmp_path):
     """By the figures of Python; the first of four focal lengths is longer by `step`."""

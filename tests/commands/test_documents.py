@@ -19,6 +19,7 @@ def test_json_is_the_summary_and_nothing_else(name, example):
     assert said["program"].startswith("jaxro ")
 
 
+@pytest.mark.slow
 def test_a_pose_graph_of_a_strip(tmp_path):
     """Photos that share points: every edge has the length that the points tell."""
     random = np.random.default_rng(3)

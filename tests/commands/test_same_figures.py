@@ -58,7 +58,10 @@ def measure(pairs: int) -> dict[str, list]:
 
 @pytest.fixture(
     scope="module",
-    params=["one", pytest.param("few", marks=pytest.mark.slow), "many"],
+    params=[
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("one", "few")),
+        "many",
+    ],
 )
 def folder(request, tmp_path_factory):
     """The same measurements as table.csv and table.parquet."""

@@ -624,6 +624,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_ends_in_the_same_bytes(folder, whole):
     pytest.importorskip("ray")
     script = folder / "cluster.py"

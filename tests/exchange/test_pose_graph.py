@@ -327,6 +327,7 @@ def test_parts_failures_and_bad_graphs():
         pose_graph(["a"] * 3, ["a"] * 3, three, 100.0, 1.0, sigma0=1.0)
 
 
+@pytest.mark.slow
 def test_lengths_by_common_points():
     """Their errors are what their deviations say; pairs that share no point with others
     have no length."""

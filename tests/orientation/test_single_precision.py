@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
+import pytest
 from workload import FOCAL, aerial
 
 import jaxro
@@ -19,6 +20,7 @@ def angles(one: jaxro.RelativePose, other: jaxro.RelativePose) -> np.ndarray:
     return 2 * np.max(np.abs(entries(one) - entries(other)), axis=0)
 
 
+@pytest.mark.slow
 def test_subsets_are_solved_to_their_noise():
     """Five points solved in single precision: 1e-5 rad beside the exact solution, a
     hundredth of what noise does."""

@@ -231,7 +231,8 @@ def test_a_pose_that_no_weight_holds_is_not_at_rest():
     assert np.all(ended(found, OUTCOMES.did_not_rest))
 
 
-@pytest.mark.parametrize("points", [pytest.param(8, marks=pytest.mark.slow), 12])
+@pytest.mark.slow
+@pytest.mark.parametrize("points", [8, 12])
 def test_least_median_of_few_points_is_not_the_fit_of_five(points):
     """Without errors: most points stay, and sigma0 is not far below the noise (a
     hundredth of it and less, if the median were that of all points, of which a subset
@@ -261,9 +262,10 @@ def test_median_without_sorting():
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "procedure",
-    [pytest.param(Ransac(hypotheses=Newton()), marks=pytest.mark.slow), LeastMedian()],
+    [Ransac(hypotheses=Newton()), LeastMedian()],
     ids=["ransac", "least median"],
 )
 def test_random_subsets_stand_two_fifths_of_forty_points_wrong(procedure):

@@ -200,6 +200,7 @@ def test_matches_of_other_points_in_any_position():
     assert np.all(angle[np.asarray(usable)] < np.deg2rad(0.1))
 
 
+@pytest.mark.slow
 def test_no_target_of_a_regular_field_is_rejected_for_a_wrong_pose():
     """Walls and boards of targets, photos in any position, no wrong point: a part of a
     field, or its plane, may fit a pose that is far off. Where all targets lie in one

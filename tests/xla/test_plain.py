@@ -81,6 +81,7 @@ def test_near_vertical_pairs_and_pairs_in_any_position(pairs):
     check(lambda: jaxro.orient_batch(both))
 
 
+@pytest.mark.slow
 def test_one_loop_of_points(pairs, monkeypatch):
     monkeypatch.setattr(batch, "ALONE", 0)
     monkeypatch.setattr(batch, "MOMENT", 0)
