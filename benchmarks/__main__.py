@@ -33,6 +33,7 @@ def main() -> int:
         reading,
         rejection,
         scale,
+        weak_bases,
     )
     from .common import QUICK, Size
 
@@ -44,6 +45,7 @@ def main() -> int:
         | scale.SUITES
         | colmap.SUITES
         | photos.SUITES
+        | weak_bases.SUITES
         | calibration.SUITES
         | block.SUITES
     )

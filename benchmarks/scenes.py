@@ -599,3 +599,91 @@ def _plain(rng: np.random.Generator, points: int, wrong: float) -> tuple:
         base,
         True,
     )
+
+
+# ------------------------------------------------------------------------------------
+# weak bases
+
+WITHOUT_BASE = ("rotation", "far", "shallow")
+"""The photos only turn; the scene is 100 bases away; its relief is 1 % of its
+distance."""
+
+
+BESIDE = 0.05
+"""Half of the wrong points are anywhere, half of them so many photo widths away from
+where they should be."""
+
+
+def weak_bases(
+    kind: str, pairs: int, points: int, wrong: float, *, seed: int = 0
+) -> Scenes:
+    """Pairs of one kind: of `WITHOUT_BASE`, or `plane` or `space`; normal noise of f/5,000 to
+    f/1,000."""
+    kinds = (*WITHOUT_BASE, "plane", "space")
+    begin = [seed, kinds.index(kind), points, round(1000 * wrong)]
+    parts = [
+        _weak(np.random.default_rng([*begin, number]), kind, points, wrong)
+        for number in range(pairs)
+    ]
+    return Scenes(
+        *(
+            np.stack([np.asarray(v) for v in field])
+            for field in zip(*parts, strict=True)
+        )
+    )
+
+
+def _weak(rng: np.random.Generator, kind: str, points: int, wrong: float) -> tuple:
+    focal = 1000.0
+    photo = Photo(focal, focal * rng.uniform(0.4, 0.8), focal * rng.uniform(0.3, 0.5))
+    sigma = focal / np.exp(rng.uniform(np.log(1000), np.log(5000)))
+    base = direction(rng) * (1, 1, 0.5)
+    base = base / np.linalg.norm(base)
+    while True:
+        rotation = turn(direction(rng), rng.uniform(0, np.deg2rad(15)))
+        left = photo.uniform(rng, 8 * points)
+        depth = _depths_of(rng, kind, left, focal)
+        space = rays(left, focal) / focal * depth[:, None]
+        station = base if kind != "rotation" else 0 * base
+        right, front = project(space, rotation, station, focal)
+        seen = front & photo.holds(right)
+        if np.sum(seen) >= points:
+            break
+    left, right = left[seen][:points], right[seen][:points]
+    good = np.arange(points) >= round(wrong * points)
+    moved = rng.normal(0, BESIDE * 2 * photo.width, (points, 2))
+    other = np.where(
+        rng.random((points, 1)) < 0.5, photo.uniform(rng, points), right + moved
+    )
+    right = np.where(good[:, None], right, other)
+    left, right = (p + rng.normal(0, sigma, p.shape) for p in (left, right))
+    near = np.abs(sampson(left, right, focal, rotation, base))
+    close = near <= UNDECIDABLE * sigma
+    return (
+        *left.T,
+        *right.T,
+        np.ones(points, bool),
+        good,
+        ~good & close,
+        focal,
+        sigma,
+        rotation,
+        base,
+        kind != "rotation",
+    )
+
+
+def _depths_of(rng: np.random.Generator, kind: str, left: Array, focal: float) -> Array:
+    """Depths in bases."""
+    count = len(left)
+    if kind in ("rotation", "far"):
+        return 100 * rng.uniform(0.7, 1.4, count)
+    distance = rng.uniform(2, 6)
+    if kind == "space":
+        return distance * rng.uniform(0.7, 1.4, count)
+    slope, around = np.deg2rad(rng.uniform(0, 45)), rng.uniform(0, 2 * np.pi)
+    across = np.sin(slope) * np.array([np.cos(around), np.sin(around)])
+    scale = np.maximum(np.cos(slope) - left / focal @ across, 0.1)
+    relief = 0.01 if kind == "shallow" else 0.0
+    depth = distance * np.cos(slope) / scale
+    return depth * (1 + relief * rng.uniform(-1, 1, count))

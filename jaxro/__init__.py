@@ -83,6 +83,10 @@ from .geometry.pairs import (
 )
 from .orientation import planes as planes, starts as starts
 from .orientation.orient import orient as orient
+from .orientation.pure_rotation import (
+    PureRotation as PureRotation,
+    orient_rotation as orient_rotation,
+)
 from .orientation.result import Orientation as Orientation
 from .orientation.results import RESULTS as RESULTS, is_usable as is_usable
 from .xla.notices import announce as announce

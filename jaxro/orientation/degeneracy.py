@@ -75,12 +75,9 @@ def worst_direction(
     through both stations, have there another minimum that the linearised statistics of
     the first know nothing of.
     """
-    direction = _worst_of(elements, cofactor)
+    direction = direction_of_worst(elements, cofactor)
     matrices = _bend(pair, elements, direction)
     bent = _sum_along(pair, *matrices)
-    ratio = bent.change / jnp.where(bent.drift > 0, bent.drift, 1.0)
-    reach = jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0))
-    margin = jnp.where(bent.drift > 0, reach, jnp.inf)
 
     columns = _along_columns(pair, elements, bent.by_entry)  # Aᵀc
     taken = quadratic([list(row) for row in cofactor], columns)
@@ -89,14 +86,40 @@ def worst_direction(
     turn = 2 * bent.change / jnp.where(straight, 1.0, back)
     turn = jnp.where(straight, jnp.inf, turn)
     return WorstDirection(
-        margin=margin,
+        margin=_margin(bent.change, bent.drift),
         away=turn * jnp.sqrt(jnp.maximum(bent.change, 0.0)),
         turn=turn,
         rise=jnp.maximum(bent.bends - taken, 0.0) * turn**4 / 4,
     )
 
 
-def _worst_of(elements: AbstractElements, cofactor: Float[Array, "5 5"]) -> list:
+def margin_along(
+    pair: Pair, elements: AbstractElements, direction: list
+) -> Float[Array, ""]:
+    """The `margin` of `WorstDirection`, along any direction of the elements."""
+    f, slope, _ = _bend(pair, elements, direction)
+
+    def of_point(point, sigma, use, roots):
+        _, square, _ = coplanarity.linearise(f, point, use, roots)
+        g, drift, _ = coplanarity.linearise(slope, point, use, roots)
+        weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
+        return g**2 * weight, drift * sigma**2 * weight
+
+    measured = pair.coordinates, pair.sigma, pair.mask, pair.roots
+    return _margin(*sums(jax.vmap(of_point)(*measured)))
+
+
+def _margin(change: Float[Array, ""], drift: Float[Array, ""]) -> Float[Array, ""]:
+    """The errors of the coordinates at which the drift that they cause is as large as
+    the change."""
+    ratio = change / jnp.where(drift > 0, drift, 1.0)
+    reach = jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0))
+    return jnp.where(drift > 0, reach, jnp.inf)
+
+
+def direction_of_worst(
+    elements: AbstractElements, cofactor: Float[Array, "5 5"]
+) -> list:
     """The worst determined direction, of length 1 in rad, in the units of the
     elements."""
     in_rad, units = in_radians(elements, cofactor)

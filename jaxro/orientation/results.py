@@ -59,6 +59,12 @@ class RESULTS(results.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "is no length: 0, not finite, or negative for IndependentElements. Give "
         "another base, or use RelativePose, which exists for every position."
     )
+    carried_by_few = (
+        "A few points alone carry the base: without those of the smallest redundancy "
+        "the others do not determine it, and wrong points like those that were "
+        "rejected may agree with it by chance. Measure these points again, or more "
+        "points at other depths."
+    )
 
 
 def of_adjustment(result: results.RESULTS) -> RESULTS:

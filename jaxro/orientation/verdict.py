@@ -38,7 +38,7 @@ def verdict(
     freedom = adjustment.degrees_of_freedom
     solved = adjustment.result == results.RESULTS.successful
 
-    weakest = _largest_variance(adjustment.parameters, adjustment.cofactor)
+    weakest = largest_variance(adjustment.parameters, adjustment.cofactor)
     direction = degeneracy.worst_direction(
         pair, adjustment.parameters, adjustment.cofactor
     )
@@ -73,7 +73,7 @@ def verdict(
     return result
 
 
-def _largest_variance(
+def largest_variance(
     elements: AbstractElements, cofactor: Float[Array, "5 5"]
 ) -> Float[Array, ""]:
     """The largest cofactor of an element in rad, of the base over its length."""
@@ -96,7 +96,7 @@ def _lack_elements(
     less certain than it."""
     pose = description.pose
     base = pose.bx, pose.by, pose.bz
-    variance = _largest_variance(description.elements, description.cofactor)
+    variance = largest_variance(description.elements, description.cofactor)
     missing = ~problem.elements.exist(base, description.length)
     uncertain = description.noise.size**2 * variance > WEAK**2
     # without redundancy there is no noise to judge by

@@ -119,7 +119,11 @@ def classify(pair: Pair, verdict: Verdict) -> Found:
     limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
     plane = in_plane(pair, verdict.pose, verdict.mask, limit)
     pose, use, turned = without_base(pair, plane.pose, plane.use, verdict.result, limit)
-    weak = verdict.result == RESULTS.weakly_determined
+    weak = (verdict.result == RESULTS.weakly_determined) | (
+        verdict.result == RESULTS.carried_by_few
+    )
+    # the other pose of a plane, which explains the matches as well
+    either = plane.alone | (verdict.result == RESULTS.two_solutions)
     # matches behind a photo are here infinitely far within their errors
     fair = (
         is_usable(verdict.result)
@@ -129,9 +133,9 @@ def classify(pair: Pair, verdict: Verdict) -> Found:
     # without a base any base is as good as another one, so that the engine may doubt
     # the base that it found
     convinced = turned | (fair & (verdict.outcome != OUTCOMES.no_consensus))
-    kind = jnp.where(plane.alone, int(Kind.plane), int(Kind.oriented))
+    kind = jnp.where(either, int(Kind.plane), int(Kind.oriented))
     for holds, other in (
-        (weak & ~plane.alone, Kind.weak),
+        (weak & ~either, Kind.weak),
         (turned, Kind.rotation),
         (~convinced | ~certain(pair, pose, use, limit), Kind.no_consensus),
         (count(pair.mask) < 6, Kind.too_few),

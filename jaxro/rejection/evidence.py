@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, ScalarLike
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
 from ..xla.passes import count
-from .agreement import points_within
+from .agreement import points_within, squares
 from .masked import Use, Values, mean_of, sum_of
 from .subsets import move_up_coordinates
 
@@ -108,6 +108,17 @@ def chance_by_distance(
     """
     mean = mean_of(jnp.sqrt(squares), out)
     return limit / jnp.maximum(mean, 2 * limit)
+
+
+def chance_of_agreement(
+    pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The chance that a wrong point agrees with a pose: by the partners of other
+    points, and by the distances of the points that are not in use."""
+    agreed, asked = shifted_agreement(pair, pose, limit)
+    out = pair.mask & ~use
+    spread = chance_by_distance(squares(pair, pose), out, limit) / 2
+    return jnp.maximum((agreed + 1) / (asked + 2), spread)
 
 
 def log_accidents(

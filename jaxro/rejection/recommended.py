@@ -30,8 +30,9 @@ from ..xla.kernels import if_needed
 from ..xla.passes import count
 from .agreement import familywise_limit, normalised_residuals, state_sigma
 from .base import OUTCOMES, AbstractDecider, AbstractProcedure, Decision, Rejection
+from .carried import witnesses
 from .fading import fade
-from .masked import Use
+from .masked import Use, choose
 from .quick import Plain, Quick
 from .stages import FEW, AbstractStage, scale_sigma
 from .thorough import Thorough
@@ -141,11 +142,15 @@ class Recommended(AbstractProcedure):
         scale = scale * self._level.first_sigma(fixed)
         fixed = scale_sigma(fixed, scale)
         limit = self._level.limit(pair)
+        base = witnesses(fixed, pose, use, believed, limit)
+        use = jnp.where(base.turned, base.still, use)
+        pose = choose(base.turned, base.rotation, pose)
         w = normalised_residuals(linearise(fixed, pose), use)
         weighted = fade(scale_sigma(pair, scale), pose, use & believed)
-        result = verdict(scale_sigma(weighted, 1 / scale), pose, use, limit, w)
+        result = verdict(scale_sigma(weighted, 1 / scale), pose, use, limit, w, base)
         result = result.only_if(believed, OUTCOMES.no_consensus)
-        return result.take_back(_in_doubt(fixed, pose, use, believed))
+        carried = believed & ~base.turned
+        return result.take_back(_in_doubt(fixed, pose, use, carried))
 
     @property
     def _level(self) -> Level:

@@ -23,6 +23,11 @@ LONGEST = 0.3
 """The longest component of a step (rad)."""
 
 
+NARROWER, NARROWINGS = 0.7, 12
+"""The factor by which the limit narrows in two steps, and the number of steps: down to
+an eighth."""
+
+
 def take_step(pose: RelativePose, linear: Linear, weight: Values) -> RelativePose:
     """The pose after one step with these weights in place of those of `linear`, no
     component longer than LONGEST. A step that is no number is not taken."""
@@ -88,6 +93,20 @@ def geman_mcclure(squares: Values, variance: Float[Array, ""] | float) -> Values
     """The weights of Geman and McClure (1985), (k² / (k² + s))², of squared residuals
     s; `variance` = k². They fall to a quarter at s = k²."""
     return (variance / (variance + squares)) ** 2
+
+
+def narrow(pair: Pair, pose: RelativePose, limit: ScalarLike) -> RelativePose:
+    """The pose that the points near it lead to, as the limit within which they count
+    narrows (weights of Geman and McClure): where sigma is too large, wrong points
+    within the limit hide the right pose from a search."""
+
+    def step(pose, k):
+        width = limit * NARROWER ** (k / 2)
+        weight = lambda s: geman_mcclure(s, width**2)
+        return step_by_weights(pair, pose, weight), None
+
+    steps = jnp.arange(NARROWINGS, dtype=pair.focal_left.dtype)
+    return lax.scan(step, pose, steps)[0]
 
 
 def from_vertical(pair: Pair, steps: int) -> RelativePose:

@@ -30,7 +30,7 @@ from .stages import (
     scale_sigma,
     settle,
 )
-from .steps import from_vertical, geman_mcclure, step_by_weights
+from .steps import from_vertical, narrow
 
 STEPS = 8
 """Steps of least squares from the vertical."""
@@ -58,10 +58,6 @@ may agree by accident."""
 SURE = 30.0
 """Redundancy of the noise found from which it may contradict the sigma stated: of fewer
 points some fit by accident."""
-
-NARROWER, NARROWINGS = 0.7, 12
-"""The factor by which the limit narrows in two steps, and the number of steps: down to
-an eighth."""
 
 MOST = 20.0
 """How many times larger or smaller than the stated noise the noise found may be."""
@@ -137,7 +133,7 @@ class Thorough(AbstractStage):
         """Whether the search was thorough enough, and the points in use are no
         accident."""
         of = count(pair.mask)
-        chance = _chance(pair, pose, use, limit)
+        chance = evidence.chance_of_agreement(pair, pose, use, limit)
         by_losers = found.agreed / jnp.maximum(found.asked, 1.0)
         chance = jnp.maximum(chance, by_losers)
         s = squares(pair, pose)
@@ -159,7 +155,7 @@ class Thorough(AbstractStage):
             begin = self.search.begin(own, state.found.pose)
             worth = self._worth(own, state.found.pose, limit)
             found = self.search.run(own, begin, worth)
-            narrowed = _narrow(own, found.pose, self.search.limit)
+            narrowed = narrow(own, found.pose, self.search.limit)
             new = self._new_scale(pair, own, scale, found.pose, narrowed)
             again = (new < APART * scale) | (scale < APART * new)
             pose = choose(again, narrowed, found.pose)
@@ -208,7 +204,7 @@ class Thorough(AbstractStage):
         believed."""
         of = count(pair.mask)
         use = points_within(pair, pose, limit)
-        chance = _chance(pair, pose, use, limit)
+        chance = evidence.chance_of_agreement(pair, pose, use, limit)
         most = self._most_accidents(of)
         fewest = evidence.fewest_points(chance, of, most, pair.mask.shape[0])
         return jnp.maximum(self.search.enough_for(fewest, of), float(self.least))
@@ -227,16 +223,6 @@ class Thorough(AbstractStage):
         poses = jax.tree.map(lambda *each: jnp.stack(each), *found)
         costs = lax.map(lambda pose: cost_of(pair, pose, self.search.limit), poses)
         return best(poses, costs)
-
-
-def _chance(
-    pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]
-) -> Float[Array, ""]:
-    """The chance that a wrong point agrees with a pose."""
-    agreed, asked = evidence.shifted_agreement(pair, pose, limit)
-    out = pair.mask & ~use
-    spread = evidence.chance_by_distance(squares(pair, pose), out, limit) / 2
-    return jnp.maximum((agreed + 1) / (asked + 2), spread)
 
 
 class Settled(NamedTuple):
@@ -296,17 +282,3 @@ def _other_pose(
         return planes.second(in_plane, facing, plane.normal)
 
     return if_needed(flat & asked, find, (pose, asked & False))
-
-
-def _narrow(pair: Pair, pose: RelativePose, limit: ScalarLike) -> RelativePose:
-    """The pose that the points near it lead to, as the limit within which they count
-    narrows (weights of Geman and McClure): where sigma is too large, wrong points
-    within the limit hide the right pose from a search."""
-
-    def step(pose, k):
-        width = limit * NARROWER ** (k / 2)
-        weight = lambda s: geman_mcclure(s, width**2)
-        return step_by_weights(pair, pose, weight), None
-
-    steps = jnp.arange(NARROWINGS, dtype=pair.focal_left.dtype)
-    return lax.scan(step, pose, steps)[0]

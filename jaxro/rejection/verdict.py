@@ -12,6 +12,7 @@ from ..orientation.orient import orient
 from ..xla.passes import count
 from .agreement import normalised_residuals
 from .base import AbstractProcedure, Rejection
+from .carried import Witnesses
 from .masked import Use, Values
 from .rounds import Round, conclude_round, finished_if, independent_values
 from .visibility import seen
@@ -26,9 +27,15 @@ class AbstractSearch(AbstractProcedure):
 
 
 def verdict(
-    pair: Pair, pose: RelativePose, use: Use, limit: ArrayLike, w: Values | None = None
+    pair: Pair,
+    pose: RelativePose,
+    use: Use,
+    limit: ArrayLike,
+    w: Values | None = None,
+    base: Witnesses | None = None,
 ) -> Rejection:
-    """The result that only the points in `use` are right, with their orientation.
+    """The result that only the points in `use` are right, with their orientation, and
+    what the witnesses say of its `base`.
 
     The evidence is |w| against the limit: the `w` by which the points were chosen, or
     else the one of this orientation; it is infinite for a point that was rejected as it
@@ -39,6 +46,8 @@ def verdict(
     solved = orient(pair.with_mask(use), start=pose)
     if w is None:
         w = normalised_residuals(linearise(pair, solved.pose), use)
+    if base is not None:
+        solved = base.judge(solved)
     limit = jnp.asarray(limit, w.dtype)
     unseen = ~use & (w <= limit) & ~seen(pair, solved.pose, limit)
     w = jnp.where(unseen, jnp.inf, w)

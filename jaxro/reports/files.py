@@ -17,6 +17,7 @@ import numpy as np
 
 from ..assessment import Pattern
 from ..geometry.pairs import Camera
+from ..orientation.pure_rotation import ANGLES, PureRotation
 from ..tables.measured import to_list
 from .columns import TABLES, Column, Units, head
 from .model import Element, One, Results
@@ -127,8 +128,23 @@ def _pair(one: One) -> dict[str, Any]:
         "sigma0": one.value("sigma0"),
         "elements": {e.name: _element(e) for e in one.elements},
         "correlations": one.correlations,
+        "rotation": _rotation(one.rotation),
         "pattern": _pattern(one.pattern, one.results.units),
         "cameras": [_camera(camera) for camera in one.cameras],
+    }
+
+
+def _rotation(rotation: PureRotation | None) -> dict[str, Any] | None:
+    """The rotation of a pair without a base, and the deviations of its turns about the
+    axes of the left photo."""
+    if rotation is None:
+        return None
+    return {
+        "unit": "deg",
+        **dict(zip(ANGLES, np.degrees(rotation.angles).tolist(), strict=True)),
+        "sd": dict(zip("xyz", np.degrees(rotation.deviations).tolist(), strict=True)),
+        "sigma0": float(rotation.sigma0),
+        "degrees_of_freedom": int(rotation.degrees_of_freedom),
     }
 
 

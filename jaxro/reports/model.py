@@ -19,6 +19,7 @@ from ..batches.ragged import Ragged
 from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Camera, Coordinates, Pair, mask_unusable
+from ..orientation.pure_rotation import PureRotation, orient_rotation
 from ..tables.measured import CameraPairs, Table, take, to_list
 from ..xla.programs import compiled
 from ..xla.settings import MOMENT, settings_for
@@ -59,7 +60,8 @@ class Element:
 class Results:
     """Oriented pairs: the columns of the pairs and, by table, of the points that
     `table` holds, those kept. `confidence`: of the intervals that are asked for;
-    `patterns`: by the numbers of the pairs."""
+    `patterns`, and `rotations` of pairs without a base: by the numbers of the
+    pairs."""
 
     table: Table
     cameras: CameraPairs
@@ -70,6 +72,7 @@ class Results:
     of_points: dict[str, dict[str, Any]]
     confidence: float | None = None
     patterns: dict[int, Pattern] = field(default_factory=dict)
+    rotations: dict[int, PureRotation] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.table.names)
@@ -218,6 +221,25 @@ class One:
     def pattern(self) -> Pattern | None:
         """Whether residuals of neighbouring points agree; None where nothing tells."""
         return self.results.patterns.get(self.number)
+
+    @property
+    def rotation(self) -> PureRotation | None:
+        """The rotation of a pair without a base; None of other pairs."""
+        return self.results.rotations.get(self.number)
+
+
+def find_rotations(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, PureRotation]:
+    """The rotations of pairs whose base is zero, by the numbers of the pairs; of the
+    first MOST_PAIRS."""
+    still = [k for k, name in RESULT_NAMES.items() if name == "zero_base"]
+    chosen = np.flatnonzero(np.isin(of_pairs["result"], still))[:MOST_PAIRS]
+
+    def find(number: int) -> PureRotation:
+        size = int(pairs.lengths[number])
+        padded = pairs.pad_to(np.array([number]), size)
+        return orient_rotation(jax.tree.map(lambda a: a[0], padded))
+
+    return {int(number): find(number) for number in chosen}
 
 
 def find_patterns(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, Pattern]:

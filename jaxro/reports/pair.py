@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ..orientation.pure_rotation import ANGLES, PureRotation
 from ..tables.measured import COORDINATES
 from .model import One, Results
 from .rows import left_out, most_rows, worst
@@ -37,11 +38,27 @@ def _show_one(console: Console, one: One, subtitle: str) -> None:
     )
     console.print(_cameras(one) + subtitle)
     console.print(_verdict(one))
+    if one.rotation is not None:
+        console.print(describe_rotation(one.rotation))
     if one.usable:
         console.print(_elements(one))
         show_numbers(console, one)
         console.print(_correlations(one))
     _show_points(console, one)
+
+
+def describe_rotation(rotation: PureRotation) -> str:
+    """The rotation of a pair without a base, in a line."""
+    deviations = np.degrees(rotation.deviations)
+    decimals = digits(float(np.max(deviations)))
+    angles = zip(ANGLES, np.degrees(rotation.angles), strict=True)
+    named = "  ".join(f"{name} {number(a, decimals)}°" for name, a in angles)
+    spread = " ".join(number(d, decimals) for d in deviations)
+    return (
+        f"The right photo is turned by {named}, ± {spread}° about the axes x y z of "
+        f"the left one; sigma0 {number(rotation.sigma0, digits(rotation.sigma0))}, "
+        f"{int(rotation.degrees_of_freedom)} degrees of freedom"
+    )
 
 
 def show_elements(console: Console, one: One) -> None:

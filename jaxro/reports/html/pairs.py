@@ -10,7 +10,13 @@ from rich.console import Console
 from .. import cleaning, reliability
 from ..columns import OUTCOME_ADVICE
 from ..model import One, Results
-from ..pair import digits, show_elements, show_numbers, unit_name
+from ..pair import (
+    describe_rotation,
+    digits,
+    show_elements,
+    show_numbers,
+    unit_name,
+)
 from ..pair_plots import worst
 from ..rows import showing
 from ..text import number
@@ -159,7 +165,9 @@ def _verdict(one: One, cleaned: Cleaned | None, number_of: int) -> Prose:
     """Whether the elements may be used, in one sentence."""
     outcome = None if cleaned is None else cleaned.verdicts.outcomes[number_of]
     if not one.usable:
-        return Prose(f"Not usable: {one.advice}", Tone.bad)
+        turned = one.rotation
+        more = "" if turned is None else f" {describe_rotation(turned)}."
+        return Prose(f"Not usable: {one.advice}{more}", Tone.bad)
     if outcome not in (None, "finished"):
         return Prose(f"Not settled: {OUTCOME_ADVICE[outcome]}", Tone.bad)
     if one.advice:
