@@ -28,6 +28,7 @@ def main() -> int:
         calibration,
         colmap,
         engine,
+        facades,
         first,
         photos,
         reading,
@@ -46,6 +47,7 @@ def main() -> int:
         | colmap.SUITES
         | photos.SUITES
         | weak_bases.SUITES
+        | facades.SUITES
         | calibration.SUITES
         | block.SUITES
     )

@@ -687,3 +687,112 @@ def _depths_of(rng: np.random.Generator, kind: str, left: Array, focal: float) -
     relief = 0.01 if kind == "shallow" else 0.0
     depth = distance * np.cos(slope) / scale
     return depth * (1 + relief * rng.uniform(-1, 1, count))
+
+
+# ------------------------------------------------------------------------------------
+# repeated facades
+
+FACADES = ("none", "beside", "among")
+"""Without a common view; a true consensus beside a larger repeated piece; many true
+matches, and a smaller piece."""
+
+FACADE_MATCHES = 200
+
+PIECE_WINDOWS = (3, 11)
+"""Windows of a repeated piece."""
+
+PIECE_WIDTH = (0.15, 0.4)
+"""Width of the piece, as a part of the photo's."""
+
+PIECE_MATCHES = (20, 70)
+"""Matches of the piece."""
+
+PIECE_RELIEF = 0.02
+"""Depth of its windows, as a part of the width of the piece."""
+
+PIECE_NEAR = 0.1
+"""How far the matches of a window are from its middle, as a part of the step from
+window to window."""
+
+
+def repeated_facades(kind: str, pairs: int, *, seed: int = 0) -> Scenes:
+    """Pairs of one of the `FACADES`, of FACADE_MATCHES matches each.
+
+    A repeated piece is one and the same structure at two places: its matches fit a pose
+    of their own, exactly and all together, but lie in a small part of both photos, some
+    at every window. They are true matches of nothing.
+    """
+    begin = [seed, FACADES.index(kind)]
+    parts = [
+        _facade(np.random.default_rng([*begin, number]), kind, number)
+        for number in range(pairs)
+    ]
+    fields = zip(*parts, strict=True)
+    return Scenes(*(np.stack([np.asarray(v) for v in field]) for field in fields))
+
+
+def _facade(rng: np.random.Generator, kind: str, number: int) -> tuple:
+    """The fields of one pair."""
+    base = BASES[number % len(BASES)]
+    piece = int(rng.integers(PIECE_MATCHES[0], PIECE_MATCHES[1] + 1))
+    if kind == "none":
+        true = 0
+        pair = photographs(1, FACADE_MATCHES, 1.0, base, common=False, seed=number)
+    else:
+        least, most = (0.4, 0.8) if kind == "beside" else (1.5, 3.0)
+        true = int(
+            np.clip(piece * rng.uniform(least, most), 12, FACADE_MATCHES - piece - 20)
+        )
+        wrong = 1 - true / FACADE_MATCHES
+        pair = photographs(1, FACADE_MATCHES, wrong, base, seed=number)
+    coordinates = np.stack(pair.coordinates)[:, 0]
+    photo = _photo_of(coordinates, float(pair.focal[0]))
+    left, right = _piece(rng, photo, piece)
+    sigma = float(pair.sigma[0])
+    left, right = noise(rng, left, right, photo, sigma)
+
+    # the piece takes the places of wrong matches
+    places = rng.permutation(np.flatnonzero(~pair.good[0]))[:piece]
+    coordinates[:, places] = [*left.T, *right.T]
+    sides = coordinates[:2].T, coordinates[2:].T
+    pose = pair.rotation[0], pair.base[0]
+    near = np.abs(sampson(*sides, photo.focal, *pose))
+    close = near <= UNDECIDABLE * sigma
+    return (
+        *coordinates,
+        pair.there[0],
+        pair.good[0],
+        ~pair.good[0] & close & pair.common[0],
+        photo.focal,
+        sigma,
+        *pose,
+        pair.common[0],
+    )
+
+
+def _photo_of(coordinates: Array, focal: float) -> Photo:
+    """The photo that holds these matches."""
+    x, y = np.abs(coordinates[::2]), np.abs(coordinates[1::2])
+    return Photo(focal, float(np.max(x)), float(np.max(y)))
+
+
+def _piece(rng: np.random.Generator, photo: Photo, count: int) -> tuple[Array, Array]:
+    """The matches of a repeated piece in both photos, by a pose of its own."""
+    windows = int(rng.integers(PIECE_WINDOWS[0], PIECE_WINDOWS[1] + 1))
+    while True:
+        rotation, base, distance = placed(rng, str(rng.choice(BASES)))
+        width = 2 * photo.width * rng.uniform(*PIECE_WIDTH)
+        columns = max(2, int(np.ceil(np.sqrt(windows))))
+        step = width / columns
+        grid = np.stack(np.divmod(np.arange(windows), columns)[::-1], axis=1) * step
+        at = grid[rng.integers(windows, size=count)]
+        at = at + PIECE_NEAR * step * rng.uniform(-1, 1, at.shape)
+        left = photo.uniform(rng, 1) * 0.7 + at - np.mean(at, axis=0)
+        slope = rng.uniform(-0.7, 0.7, 2)
+        depth = distance / (1 + left @ slope / photo.focal)
+        relief = PIECE_RELIEF * width / photo.focal
+        depth = depth * (1 + relief * rng.uniform(-1, 1, count))
+        space = rays(left, photo.focal) / photo.focal * depth[:, None]
+        right, front = project(space, rotation, base, photo.focal)
+        if np.all(front & photo.holds(right) & photo.holds(left) & (depth > 0.2)):
+            return left, right

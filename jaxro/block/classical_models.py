@@ -134,6 +134,7 @@ def _derivatives(
         focal=tuple(focal),
         sigma=longer(sigma, 1.0),
         mask=longer(np.ones(len(one), bool), False),
+        copies=True,
     )
     return derivatives(measured, _coordinates)
 

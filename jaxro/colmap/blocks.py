@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..batches.batch import clean_in_stages
 from ..batches.buckets import buckets
 from ..batches.padding import FEWER
+from ..geometry.copies import find_copies
 from ..geometry.coplanarity import fundamental_matrix, linearise
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, pair
@@ -184,6 +185,7 @@ def orient(
     progress: Progress,
 ) -> Found:
     """What is found of pairs whose keypoints are at these places among all points."""
+    measured = pairs
     verdicts = clean_in_stages(pairs, ENGINE, verdict, ONE_BY_ONE, progress)
     again = _where_directions_matter(pairs, points, places)
     if again.size:
@@ -195,7 +197,22 @@ def orient(
         some = eqx.tree_at(lambda one: one.sigma, some, sigma * scale)
         new = clean_in_stages(some, ENGINE, verdict, ONE_BY_ONE, silent)
         pairs, verdicts = _with_rows((pairs, verdicts), again, (some, new))
-    return spread((pairs, verdicts), _classify_all.bind(), ONE_BY_ONE, chunk=1)
+    found = spread((pairs, verdicts), _classify_all.bind(), ONE_BY_ONE, chunk=1)
+    return _with_copies(found, measured, points, places)
+
+
+def _with_copies(
+    found: Found, pairs: Pair, points: PhotoPoints, places: tuple[Places, Places]
+) -> Found:
+    """What is found, with the matches kept that repeat one that is kept."""
+    left, right = places
+    seen = points.seen[left] & points.seen[right]
+    if np.array_equal(seen, pairs.mask):
+        return found
+    focal = np.minimum(pairs.focal_left, pairs.focal_right)
+    first = find_copies(pairs.coordinates, pairs.sigma, seen, focal)
+    kept = np.take_along_axis(np.asarray(found.kept), first, axis=-1)
+    return eqx.tree_at(lambda found: found.kept, found, kept & seen)
 
 
 @compiled(settings=RUN_FAST)

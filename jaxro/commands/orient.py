@@ -22,7 +22,7 @@ from ..reports.verdicts import Verdicts
 from ..tables import csv as tables, whole
 from ..tables.cameras import Cameras
 from ..tables.fields import TableError
-from ..tables.measured import CameraPairs, Table, to_ragged
+from ..tables.measured import CameraPairs, Table, tell_copies, to_ragged
 from . import other_programs, sigma as deviation
 from .documents import settings, show_json
 from .request import (
@@ -110,11 +110,12 @@ def prepare(
         procedure=procedure,
         rounds=options.out is not None,
     )
+    pairs = to_ragged(table, cameras, sigma)
     return Job(
         options=replace(options, sigma=sigma),
-        table=table,
+        table=tell_copies(table, pairs),
         cameras=cameras,
-        pairs=to_ragged(table, cameras, sigma),
+        pairs=pairs,
         task=task,
         units=units_of(options, table.has_sigma, system),
         known=known,

@@ -12,6 +12,7 @@ from jaxtyping import Int
 
 from ..batches.batch import clean_batch
 from ..batches.buckets import by_size, choose, map_ragged, rows_of
+from ..batches.copies import first_rows
 from ..batches.padding import Plan
 from ..batches.ragged import Ragged, clean_ragged, orient_ragged
 from ..geometry import coplanarity
@@ -105,9 +106,21 @@ def solve(
     outcome, decided, rounds = _clean(pairs, task, plan, threads, told)
     # of unusable points the orientation tells
     use = decided["kept"] | unusable(decided["kept"], decided["order"])
+    every = pairs
     pairs = pairs._replace(mask=pairs.mask & use)
     found = _orient(pairs, task, plan, threads, lambda done: None)
-    return Found(*found, outcome, decided, rounds)
+    return _of_copies(Found(*found, outcome, decided, rounds), every)
+
+
+def _of_copies(found: Found, pairs: Ragged) -> Found:
+    """What is found, with that of the first one of each group of copies for all of
+    them."""
+    if np.all(pairs.mask):
+        return found
+    first = first_rows(pairs._replace(mask=np.ones_like(pairs.mask)))
+    of_first = lambda tree: jax.tree.map(lambda a: np.asarray(a)[first], tree)
+    of_points, decided = of_first(found.of_points), of_first(found.decided)
+    return found._replace(of_points=of_points, decided=decided)
 
 
 def _orient(

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..batches.copies import without_copies
 from ..batches.ragged import Ragged
 from ..geometry.cofactor_roots import CofactorRoots, from_covariances
 from ..geometry.pairs import Camera
@@ -153,7 +154,7 @@ def collect(
         left=tuple(m.photos[0] for m in matches),
         right=tuple(m.photos[1] for m in matches),
         points=tuple(name for m in matches for name in m.points),
-        pairs=pairs,
+        pairs=without_copies(pairs),
         sigma_known=sigma is not None,
         warnings=tuple(warnings),
     )

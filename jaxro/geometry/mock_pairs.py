@@ -128,7 +128,7 @@ def mock_pair(
         beyond = (point[0] - base, point[1], point[2])
         return *project(left, point, focal), *project(right, beyond, focal)
 
-    return pair(*jax.vmap(photos)(x, y, scale), focal=focal)
+    return pair(*jax.vmap(photos)(x, y, scale), focal=focal, copies=True)
 
 
 def project(

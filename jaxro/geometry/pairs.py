@@ -23,6 +23,7 @@ from ..xla.programs import is_traced
 from ..xla.settings import settings_for
 from . import cofactor_roots
 from .cofactor_roots import UNIT, CofactorRoots
+from .copies import find_copies, repeated
 
 Coordinates = tuple[Float[Array, "*pairs point"], ...]
 """x_left, y_left, x_right, y_right"""
@@ -160,6 +161,7 @@ def pair(
     weight: Values | None = None,
     mask: Values | None = None,
     covariances: tuple[Values, Values] | None = None,
+    copies: bool = False,
 ) -> Pair:
     """A `Pair` from four equally long coordinate arrays (leading batch axes allowed).
 
@@ -167,8 +169,10 @@ def pair(
     coordinate, per point or for all (default 1). `weight`: relative weights, sigma /
     sqrt(weight); weight 0 leaves the point out. `covariances`, in place of sigma: the
     covariance matrices of (x, y) in the left photo and in the right one, (..., point,
-    2, 2) each or one for all. Raises ValueError where the shapes do not agree, and for
-    what are no real numbers.
+    2, 2) each or one for all. A point that repeats another one (`geometry.copies`) is
+    masked: the two are one measurement. With `copies` it takes part, as in a layout
+    that is only planned. Raises ValueError where the shapes do not agree, and for what
+    are no real numbers.
     """
     dtype = jnp.result_type(float)
     if covariances is not None and sigma is not None:
@@ -241,6 +245,10 @@ def pair(
             f"lengths {shape[:-1]}"
         )
         raise ValueError(f"pair: {fit}: {error}") from None
+    if not copies:
+        smaller = xp.minimum(*focals)
+        first = find_copies(coordinates, deviation, taking_part, smaller, xp)
+        taking_part = taking_part & ~repeated(first)
     return _as_pair(
         [*coordinates, deviation, taking_part, *focals, *jax.tree.leaves(roots)]
     )

@@ -207,9 +207,9 @@ def without_base(
 def certain(
     pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit: Float[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether so many different matches are not expected to agree by accident."""
-    again, _ = evidence.repeats(pair)
-    once = mask_unusable(pair.with_mask(pair.mask & ~again))[0]
+    """Whether so many matches at different places are not expected to agree by
+    accident."""
+    once = mask_unusable(pair.with_mask(evidence.apart(pair)))[0]
     agreed, asked = evidence.shifted_agreement(once, pose, limit)
     chance = (agreed + 1) / (asked + 2)
     return evidence.log_accidents(

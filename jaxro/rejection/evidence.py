@@ -35,6 +35,10 @@ PARTS = [2 ** (-k / 4) for k in range(14)]
 are no nearer than by accident."""
 
 
+CELLS = 10
+"""Cells along the longer side of what the points cover of a photo."""
+
+
 def chi_squared_limit(
     deviations: ScalarLike, freedom: Float[Array, ""]
 ) -> Float[Array, ""]:
@@ -177,24 +181,30 @@ def fewest_points(
     return jnp.where(jnp.any(fine), first, of)
 
 
-def repeats(pair: Pair) -> tuple[Use, Values]:
-    """The points that repeat an earlier one, and a key that is equal for equal points.
-    A repeated point is no evidence of its own."""
+def apart(pair: Pair) -> Use:
+    """One point of each group that lies in the same cell of both photos.
+
+    A structure that repeats itself, such as the windows of a facade, gives many matches
+    at few places, which agree with each other whatever they are: all of a cell are one
+    witness.
+    """
     key = jnp.zeros_like(pair.sigma)
-    for k, c in enumerate(pair.coordinates):
-        key = key + c * (k + 0.1) ** 0.5
-    order = jnp.argsort(jnp.where(pair.mask, key, jnp.inf), stable=True)
+    x_left, y_left, x_right, y_right = pair.coordinates
+    for x, y in ((x_left, y_left), (x_right, y_right)):
+        columns, rows = (_from_first(pair, c) for c in (x, y))
+        longest = jnp.maximum(jnp.max(columns), jnp.max(rows))
+        size = jnp.maximum(longest, jnp.finfo(longest.dtype).tiny) / CELLS
+        for c in (columns, rows):
+            key = key * CELLS + jnp.clip(jnp.floor(c / size), 0, CELLS - 1)
+    key = jnp.where(pair.mask, key, jnp.inf)
+    order = jnp.argsort(key, stable=True)
     in_order = key[order]
-    equal = in_order[1:] == in_order[:-1]
-    again = jnp.concatenate([jnp.zeros(1, bool), equal])
+    new = jnp.concatenate([jnp.ones(1, bool), in_order[1:] != in_order[:-1]])
     none = jnp.zeros_like(pair.mask)
-    return pair.mask & none.at[order].set(again), key
+    return pair.mask & none.at[order].set(new)
 
 
-def with_repeats(use: Use, again: Use, key: Values) -> Use:
-    """The points in use, and the points that repeat one of them."""
-    used = jnp.sort(jnp.where(use, key, jnp.inf))
-    place = jnp.searchsorted(used, key)
-    place = jnp.minimum(place, len(key) - 1)
-    in_use = used[place] == key
-    return use | (again & in_use)
+def _from_first(pair: Pair, values: Values) -> Values:
+    """The values less the least of all points; zero of masked points."""
+    least = jnp.min(jnp.where(pair.mask, values, jnp.inf))
+    return jnp.where(pair.mask, values - least, 0.0)

@@ -146,8 +146,10 @@ class Recommended(AbstractProcedure):
         use = jnp.where(base.turned, base.still, use)
         pose = choose(base.turned, base.rotation, pose)
         w = normalised_residuals(linearise(fixed, pose), use)
-        weighted = fade(scale_sigma(pair, scale), pose, use & believed)
-        result = verdict(scale_sigma(weighted, 1 / scale), pose, use, limit, w, base)
+        fading = fade(scale_sigma(pair, scale), pose, use & believed)
+        fading = fading._replace(noise=fading.noise * scale)
+        judge = lambda solved: base.judge(fading.spread(pair, use, solved))
+        result = verdict(fading.weaken(pair), pose, use, limit, w, judge)
         result = result.only_if(believed, OUTCOMES.no_consensus)
         carried = believed & ~base.turned
         return result.take_back(_in_doubt(fixed, pose, use, carried))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
-from ..geometry.elements import RelativePose
+from ..geometry.elements import RelativePose, vertical
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation import planes
 from ..xla.kernels import if_needed, while_loop
@@ -44,6 +44,9 @@ PLENTY = 64.0
 of n / PLENTY: the more points there are, the larger are the groups of repeated
 structure, which agree with many orientations."""
 
+ALIKE = 2
+"""Pieces that look alike, without whose points the search begins again."""
+
 TURNS = 2
 """Searches, the second one with the noise that the first one found."""
 
@@ -73,6 +76,16 @@ class Turn(NamedTuple):
     found: Found
 
 
+class Sought(NamedTuple):
+    """The state between searches among fewer and fewer points: how many there were,
+    whether another one is needed, the points that it is to search, and the decision."""
+
+    number: Int[Array, ""]
+    again: Bool[Array, ""]
+    among: Use
+    decision: Decision
+
+
 class Thorough(AbstractStage):
     """Random subsets in any position until a better orientation would have been met,
     and the evidence for what is found.
@@ -83,9 +96,9 @@ class Thorough(AbstractStage):
     if `believe_if_it_fits`, with at least `share` of the points and
     `accidents_at_once`. Else it is believed if the subsets were enough to have met a
     set of `better` times as many points, and sets as good are not expected by accident
-    more than `accidents` times (for many points more seldom). The chance of agreement
-    is measured on this scene: by partners shifted among the points, and by the
-    orientations that lost. Points that repeat others count once. Of a plane with other
+    more than `accidents` times (for many points more seldom), one witness
+    of each place (`evidence.apart`). The chance of agreement is measured on this scene:
+    by partners shifted among the points, and by the orientations that lost. Of a plane with other
     points beside it both poses are compared. The search ends when no set that it could
     still find would be believed, after at least `least` subsets, so that the pose is as
     good as it can be where nothing is believed.
@@ -107,39 +120,69 @@ class Thorough(AbstractStage):
     known: bool = True
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
-        again, key = evidence.repeats(pair)
-        once = mask_unusable(pair.with_mask(pair.mask & ~again))[0]
-        found, scale = self._search(once, self._near_vertical(once), limit)
-        once = scale_sigma(once, scale)
-        pose, use = _settle_better_pose(once, found.pose, limit)
+        def turn(state: Sought) -> Sought:
+            own = mask_unusable(pair.with_mask(state.among))[0]
+            found, scale = self._search(own, self._near_vertical(own), limit)
+            decision, alike = self._decide(pair, found, scale, limit)
+            first = state.number == 0
+            taken = choose(first | decision.believed, decision, state.decision)
+            return Sought(
+                number=state.number + 1,
+                again=alike & (state.number < ALIKE),
+                among=state.among & ~decision.use,
+                decision=taken,
+            )
+
+        nothing = Decision(
+            pose=vertical(jnp.zeros_like(limit)),
+            use=pair.mask & False,
+            believed=limit < 0,
+            scale=jnp.ones_like(limit),
+        )
+        asked = count(pair.mask) > 0
+        start = Sought(jnp.zeros((), int), asked, pair.mask, nothing)
+        more = lambda state: state.again
+        return while_loop(more, turn, start, pair.focal_left).decision
+
+    def _decide(
+        self, pair: Pair, found: Found, scale: Float[Array, ""], limit: Float[Array, ""]
+    ) -> tuple[Decision, Bool[Array, ""]]:
+        """What is found, with all points judged; and whether it is no accident but for
+        what its points have in common: they lie at few places."""
+        pair = scale_sigma(pair, scale)
+        pose, use = _settle_better_pose(pair, found.pose, limit)
         at_once = self.known & believe_if_it_fits(
-            once, pose, use, limit, self.share, self.accidents_at_once
+            pair, pose, use, limit, self.share, self.accidents_at_once
         )
-        return Decision(
-            pose=pose,
-            use=evidence.with_repeats(use, again, key),
-            believed=at_once | self._is_certain(once, pose, use, found, limit),
-            scale=scale,
-        )
+        # one after the other, so that it is compiled once
+        judge = lambda among: self._is_certain(pair, pose, use, among, found, limit)
+        sets = jnp.stack([evidence.apart(pair), pair.mask])
+        certain, by_points = lax.map(judge, sets)
+        believed = at_once | certain
+        decision = Decision(pose=pose, use=use, believed=believed, scale=scale)
+        return decision, by_points & ~believed
 
     def _is_certain(
         self,
         pair: Pair,
         pose: RelativePose,
         use: Use,
+        among: Use,
         found: Found,
         limit: Float[Array, ""],
     ) -> Bool[Array, ""]:
-        """Whether the search was thorough enough, and the points in use are no
-        accident."""
+        """Whether the search was thorough enough, and the points in use `among` these
+        are no accident."""
+        better = jnp.minimum(self.better * count(use), count(pair.mask))
+        met = found.counted >= self.search.enough_for(better, count(pair.mask))
+        pair = mask_unusable(pair.with_mask(among))[0]
+        use = use & pair.mask
         of = count(pair.mask)
         chance = evidence.chance_of_agreement(pair, pose, use, limit)
         by_losers = found.agreed / jnp.maximum(found.asked, 1.0)
         chance = jnp.maximum(chance, by_losers)
         s = squares(pair, pose)
         accidents = evidence.log_least_accidents(s, use, chance, of, limit)
-        better = jnp.minimum(self.better * count(use), of)
-        met = found.counted >= self.search.enough_for(better, of)
         thorough = met | (accidents <= OVERWHELMING)
         return (accidents <= self._most_accidents(of)) & thorough
 

@@ -1,6 +1,7 @@
 """The verdict of procedures that find the pose first, and the wrong points by it."""
 
 import abc
+from collections.abc import Callable
 
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
@@ -8,11 +9,10 @@ from jaxtyping import ArrayLike
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearise
 from ..geometry.pairs import Pair
-from ..orientation.orient import orient
+from ..orientation.orient import Orientation, orient
 from ..xla.passes import count
 from .agreement import normalised_residuals
 from .base import AbstractProcedure, Rejection
-from .carried import Witnesses
 from .masked import Use, Values
 from .rounds import Round, conclude_round, finished_if, independent_values
 from .visibility import seen
@@ -32,10 +32,10 @@ def verdict(
     use: Use,
     limit: ArrayLike,
     w: Values | None = None,
-    base: Witnesses | None = None,
+    judge: Callable[[Orientation], Orientation] = lambda solved: solved,
 ) -> Rejection:
-    """The result that only the points in `use` are right, with their orientation, and
-    what the witnesses say of its `base`.
+    """The result that only the points in `use` are right, with their orientation as
+    `judge` corrects it.
 
     The evidence is |w| against the limit: the `w` by which the points were chosen, or
     else the one of this orientation; it is infinite for a point that was rejected as it
@@ -46,8 +46,7 @@ def verdict(
     solved = orient(pair.with_mask(use), start=pose)
     if w is None:
         w = normalised_residuals(linearise(pair, solved.pose), use)
-    if base is not None:
-        solved = base.judge(solved)
+    solved = judge(solved)
     limit = jnp.asarray(limit, w.dtype)
     unseen = ~use & (w <= limit) & ~seen(pair, solved.pose, limit)
     w = jnp.where(unseen, jnp.inf, w)

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..batches.copies import without_copies
 from ..batches.ragged import Ragged
 from ..geometry.cofactor_roots import covariances_of, from_covariances
 from ..geometry.pairs import Camera, Pair
@@ -28,6 +29,9 @@ DEVIATIONS = tuple(f"sigma_{name}" for name in COORDINATES)
 
 COVARIANCES = ("cov_xy_left", "cov_xy_right")
 """Columns with the covariances of x and y of a photo, beside the deviations."""
+
+NAMED = 5
+"""Points that a warning names."""
 
 COLUMNS = Columns(
     ("point", *COORDINATES),
@@ -200,7 +204,8 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
 
     `sigma`: standard deviation of all coordinates in the unit of the table, where the
     table has no column of it; without both it is 1. Where the table has relative ones
-    they are multiplied by it. Missing numbers are NaN.
+    they are multiplied by it. Missing numbers are NaN. Points that repeat another one
+    are masked.
     """
     count, pairs = len(table.points), len(table.begins) - 1
 
@@ -240,7 +245,7 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
     focal_left, focal_right = np.array(
         [(left.focal, right.focal) for left, right in each], np.float64
     ).T.copy()
-    return Ragged(
+    pairs = Ragged(
         begins=table.begins,
         x_left=photo[0],
         y_left=photo[1],
@@ -252,6 +257,29 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
         focal_right=focal_right,
         roots=roots,
     )
+    return without_copies(pairs)
+
+
+def tell_copies(table: Table, pairs: Ragged) -> Table:
+    """The table with a warning that names the points that repeat another one, which
+    `to_ragged` has masked."""
+    rows = np.flatnonzero(~pairs.mask)
+    if not rows.size:
+        return table
+    several = len(table.names) > 1
+    owner = table.owners
+    of = lambda row: f" of pair {table.names[owner[row]]}" if several else ""
+    named = [
+        f"{take(table.points, rows[:NAMED])[k]}{of(row)}"
+        for k, row in enumerate(rows[:NAMED])
+    ]
+    more = ", ..." if rows.size > NAMED else ""
+    warning = (
+        f"{table.file}: {rows.size} points repeat another point of their pair "
+        f"({', '.join(named)}{more}): the same place of both photos is one measurement, "
+        "and counts once."
+    )
+    return replace(table, warnings=(*table.warnings, warning))
 
 
 def _size(camera: Camera) -> float:
