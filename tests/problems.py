@@ -154,12 +154,14 @@ CASES = {
 
 
 def read(path: Path, focal: float) -> Pair:
-    """A pair from a table with the columns id, xl, yl, xr, yr."""
+    """A pair from a table with the columns id, xl, yl, xr, yr, all rows of which were
+    used by the solution that was published with it."""
     with path.open() as file:
         rows = list(csv.DictReader(file))
     return pair(
         *(np.array([float(row[c]) for row in rows]) for c in ("xl", "yl", "xr", "yr")),
         focal=focal,
+        copies=True,
     )
 
 

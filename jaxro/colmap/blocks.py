@@ -210,7 +210,8 @@ def _with_copies(
     if np.array_equal(seen, pairs.mask):
         return found
     focal = np.minimum(pairs.focal_left, pairs.focal_right)
-    first = find_copies(pairs.coordinates, pairs.sigma, seen, focal)
+    coordinates = pairs.x_left, pairs.y_left, pairs.x_right, pairs.y_right
+    first = find_copies(coordinates, pairs.sigma, seen, focal)
     kept = np.take_along_axis(np.asarray(found.kept), first, axis=-1)
     return eqx.tree_at(lambda found: found.kept, found, kept & seen)
 

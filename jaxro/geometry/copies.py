@@ -16,11 +16,11 @@ from jaxtyping import Bool, Float, Int
 PART = 0.1
 """Two points are copies if none of their four coordinates differs by more than this
 part of its standard deviation. Of independent measurements of one place it happens once
-in 20,000 times."""
+in 100,000 times."""
 
-UNKNOWN = 3000.0
-"""No standard deviation is taken as larger than this part of the focal length, since 1
-may mean that none is known."""
+LARGEST, SMALLEST = 1 / 3_000, 1 / 100_000
+"""No standard deviation is taken as larger than the first part of the focal length; and
+as larger than the second one where it is 1, which may mean that it is not known."""
 
 AHEAD = 4
 """Points in the order of a key in which copies are looked for."""
@@ -62,7 +62,8 @@ def find_copies(
     for ahead in range(1, min(AHEAD, mask.shape[-1] - 1) + 1):
         equal = there[..., ahead:]
         for c in sorted_coordinates:
-            distance = abs(c[..., ahead:] - c[..., :-ahead])
+            with np.errstate(invalid="ignore", over="ignore"):
+                distance = abs(c[..., ahead:] - c[..., :-ahead])
             equal = equal & (distance <= sorted_most[..., ahead:])
         nobody = xp.zeros((*mask.shape[:-1], ahead), bool)
         equal = xp.concatenate([nobody, equal], axis=-1)
@@ -75,13 +76,16 @@ def find_copies(
 
 
 def key_of(coordinates: Sequence[Float[Any, "*points"]]) -> Float[Any, "*points"]:
-    """A number of every point by which copies are looked for."""
-    return sum(c * factor for c, factor in zip(coordinates, KEY, strict=True))
+    """A number of every point by which copies are looked for; none that is finite where
+    a coordinate is not."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return sum(c * factor for c, factor in zip(coordinates, KEY, strict=True))
 
 
 def distance_of(sigma: Any, focal: Any, xp: ModuleType = np) -> Any:
     """The largest difference of a coordinate of two copies."""
-    return PART * xp.minimum(sigma, focal / UNKNOWN)
+    most = focal * xp.where(sigma == 1, SMALLEST, LARGEST)
+    return PART * xp.minimum(sigma, most)
 
 
 def rows_with_near_keys(

@@ -40,7 +40,7 @@ def layout(points):
 def exact(points, layout=layout):
     """The errorless near-vertical pair of a layout, with its sigma."""
     x, y = 70.0 * np.array(layout(points).x), 70.0 * np.array(layout(points).y)
-    return jaxro.pair(x, y, x - 70.0, y, focal=70.0, sigma=SIGMA)
+    return jaxro.pair(x, y, x - 70.0, y, focal=70.0, sigma=SIGMA, copies=True)
 
 
 def known(one):
@@ -133,7 +133,11 @@ def test_padding_does_not_move_the_limit():
     for new, old in zip(moved, one.coordinates, strict=True):
         new[places] = np.asarray(old)
     between = jaxro.pair(
-        *moved, focal=70.0, sigma=SIGMA, mask=np.isin(np.arange(100), places)
+        *moved,
+        focal=70.0,
+        sigma=SIGMA,
+        mask=np.isin(np.arange(100), places),
+        copies=True,
     )
     for other in (spread, between):
         np.testing.assert_allclose(limits(other), limits(one), rtol=1e-9)
