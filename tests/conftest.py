@@ -34,6 +34,7 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 import jax  # noqa: E402
 from examples import example  # noqa: E402, F401 (a fixture of all tests)
+from jax.experimental.compilation_cache import compilation_cache  # noqa: E402
 from program_budget import Budget  # noqa: E402
 
 from jaxro.xla import programs, settings  # noqa: E402
@@ -72,6 +73,21 @@ def memory():
         jax.clear_caches()
         programs.forget()
         gc.collect()
+
+
+@pytest.fixture
+def unkept():
+    """Every program is compiled: none is left in memory or in JAX's own cache."""
+    folder = jax.config.jax_compilation_cache_dir
+
+    def use(folder: str | None) -> None:
+        jax.config.update("jax_compilation_cache_dir", folder)
+        compilation_cache.reset_cache()
+        programs.forget()
+
+    use(None)
+    yield
+    use(folder)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -26,7 +26,7 @@ BUDGET = {
     "orientation": 850,
     "plots": 1100,
     "published": 200,
-    "rejection": 400,
+    "rejection": 1150,
     "reports": 900,
     "surveys": 1400,
     "tables": 50,

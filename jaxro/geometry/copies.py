@@ -102,4 +102,4 @@ def rows_with_near_keys(
 
 def repeated(places: Int[Any, "*pairs point"]) -> Bool[Any, "*pairs point"]:
     """The points that repeat another one, from what `find_copies` tells."""
-    return places != np.arange(places.shape[-1])
+    return places != np.broadcast_to(np.arange(places.shape[-1]), places.shape)

@@ -245,7 +245,7 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
     focal_left, focal_right = np.array(
         [(left.focal, right.focal) for left, right in each], np.float64
     ).T.copy()
-    pairs = Ragged(
+    ragged = Ragged(
         begins=table.begins,
         x_left=photo[0],
         y_left=photo[1],
@@ -257,7 +257,7 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
         focal_right=focal_right,
         roots=roots,
     )
-    return without_copies(pairs)
+    return without_copies(ragged)
 
 
 def tell_copies(table: Table, pairs: Ragged) -> Table:
@@ -266,18 +266,16 @@ def tell_copies(table: Table, pairs: Ragged) -> Table:
     rows = np.flatnonzero(~pairs.mask)
     if not rows.size:
         return table
-    several = len(table.names) > 1
-    owner = table.owners
-    of = lambda row: f" of pair {table.names[owner[row]]}" if several else ""
-    named = [
-        f"{take(table.points, rows[:NAMED])[k]}{of(row)}"
-        for k, row in enumerate(rows[:NAMED])
-    ]
-    more = ", ..." if rows.size > NAMED else ""
+    first = rows[:NAMED]
+    points = map(str, to_list(take(table.points, first)))
+    if len(table.names) > 1:
+        pairs_of = to_list(take(table.names, table.owners[first]))
+        points = (f"{p} of {pair}" for p, pair in zip(points, pairs_of, strict=True))
+    named = ", ".join(points) + (", ..." if rows.size > NAMED else "")
+    which = "1 point repeats" if rows.size == 1 else f"{rows.size} points repeat"
     warning = (
-        f"{table.file}: {rows.size} points repeat another point of their pair "
-        f"({', '.join(named)}{more}): the same place of both photos is one measurement, "
-        "and counts once."
+        f"{table.file}: {which} another point of the pair ({named}): the same place of "
+        "both photos is one measurement, and counts once."
     )
     return replace(table, warnings=(*table.warnings, warning))
 

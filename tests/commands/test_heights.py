@@ -72,7 +72,7 @@ def test_heights_of_the_example_are_true_within_their_deviations(example):
     assert len(legs) == survey_example.TRAVERSES.count("\n") - 1
 
 
-def test_tables_of_a_user_give_the_same(tables, tmp_path, example, monkeypatch):
+def test_tables_of_a_user_give_the_same(tables, tmp_path, example, monkeypatch, unkept):
     """By a program that is kept."""
     monkeypatch.setenv("JAXRO_CACHE", str(tmp_path / "kept"))
     read = survey(*tables)

@@ -102,7 +102,7 @@ def test_a_table_says_which_points_repeat_others(tmp_path):
     asked = ("--focal", FOCAL, "--sigma", SIGMA, "--elements", "relative", "--out", out)
     done = run("clean", path, *asked)
     told = words(done.stdout + done.stderr)
-    assert "2 points repeat another point of their pair (10, 11)" in told
+    assert "2 points repeat another point of the pair (10, 11)" in told
     by_point = {row["point"]: row["verdict"] for row in rows(out / "cleaned.csv")}
     assert by_point["0"] == by_point["10"] == "rejected"
     assert by_point["4"] == by_point["11"] == "kept"

@@ -229,16 +229,6 @@ def test_old_programs_are_given_back(monkeypatch):
     assert len(programs._programs._kept) <= 3
 
 
-@pytest.fixture
-def unkept():
-    folder = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", None)
-    programs.forget()
-    yield
-    jax.config.update("jax_compilation_cache_dir", folder)
-    programs.forget()
-
-
 def long(x):
     """Some hundredth of a second, and more operations than JAX runs in the calling
     thread of itself."""
