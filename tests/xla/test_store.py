@@ -22,7 +22,7 @@ def double(x):
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, unkept):
     """A folder of kept programs, in which one is."""
     kept = tmp_path / "programs"
     store.use(kept)
