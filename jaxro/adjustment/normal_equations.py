@@ -215,15 +215,17 @@ def _inverse_of_lower(factor: Lower) -> Lower:
 
 
 class GaussNewton(optx.AbstractLeastSquaresSolver):
-    """Gauss-Newton for a few parameters; its loop carries the parameters and two step
-    sizes, nothing else.
+    """Gauss-Newton for a few parameters; its loop carries the parameters and four
+    numbers of the last steps, nothing else.
 
     `args` that know their own correction, and how a step follows others
     (`residuals.Residuals`, `joint.Joint`), are asked for it; any other residual
     function is linearised. Ends when the *next* step, predicted from the last two, is
     below atol + rtol |x|, or below ROUNDING in their place if steps no longer fall:
-    they are rounding errors then. `max_step` bounds the largest component of a step
-    (0.5 rad for orientations, where a longer one leaves the range of the
+    they are rounding errors then. Where corrections fall slowly and steadily along one
+    direction, as they do where the residuals bend or their weights change, a step is as
+    long as all that are to come (Aitken). `max_step` bounds the largest component of a
+    step (0.5 rad for orientations, where a longer one leaves the range of the
     linearisation).
     """
 
@@ -234,20 +236,22 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         dtype = jnp.result_type(*jax.tree.leaves(y))
-        return jnp.asarray(jnp.inf, dtype), jnp.zeros((), dtype)
+        none = jnp.zeros((), dtype)
+        return jnp.asarray(jnp.inf, dtype), none, none, none
 
     def step(self, fn, y, args, options, state, tags):
         known = hasattr(args, "correction")
         delta = args.correction(y) if known else _correction(fn, y, args)
-        longest = _largest(delta)
+        _, previous, *steady = state
+        stretch, steady = _stretch(_sum(delta), *steady)
+        longest = _largest(delta) * stretch
         shrink = jnp.minimum(
             1.0, self.max_step / jnp.maximum(longest, jnp.finfo(longest.dtype).tiny)
         )
-        taken = jax.tree.map(lambda d: -shrink * d, delta)
+        taken = jax.tree.map(lambda d: -shrink * stretch * d, delta)
         moved = args.further(y, taken) if known else jax.tree.map(jnp.add, y, taken)
         largest = _largest(moved)
         size = longest / (self.atol + self.rtol * largest)
-        previous = state[1]
         ratio = jnp.where(
             previous > 0,
             jnp.minimum(1.0, size / jnp.where(previous > 0, previous, 1.0)),
@@ -258,13 +262,38 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
         predicted = size * jnp.where(
             rounding, jnp.minimum(1.0, self.atol / ROUNDING), ratio
         )
-        return moved, (predicted, size), None
+        return moved, (predicted, size, *steady), None
 
     def terminate(self, fn, y, args, options, state, tags):
         return state[0] < 1, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         return y, aux, {}
+
+
+SLOW, SLOWEST, STEADY = 0.3, 0.97, 0.05
+"""The part of a correction that the next one keeps: from where, and up to where, steps
+are stretched, and how much it may change from one to the next."""
+
+
+def _stretch(
+    along: Scalar, last: Scalar, before: Scalar
+) -> tuple[Scalar, tuple[Scalar, Scalar]]:
+    """By what a step is longer than its correction, which has the component `along`
+    some direction; `last`: that of the last correction, and `before` the part of it
+    that was kept. And these two for the next step: nothing was kept after a longer
+    one."""
+    kept = along / jnp.where(last != 0, last, jnp.inf)
+    steady = jnp.abs(kept - before) < STEADY
+    stretched = steady & (kept > SLOW) & (kept < SLOWEST)
+    whole = jnp.where(stretched, kept, 0.0)
+    return 1 / (1 - whole), (along, jnp.where(stretched, 0.0, kept))
+
+
+def _sum(tree: PyTree) -> Scalar:
+    """The sum of the leaves, numbers or arrays: a component along a direction at right
+    angles to few others."""
+    return jax.tree.reduce(jnp.add, jax.tree.map(jnp.sum, tree))
 
 
 def _correction(fn: Callable, y: PyTree, args: PyTree) -> PyTree:
@@ -352,12 +381,13 @@ def steps(
     solver = GaussNewton(max_step=max_step)
 
     def body(_, x):
+        zero = jnp.zeros_like(x[0])
         return solver.step(
             lambda x, residuals: (residuals(x), None),
             x,
             residuals,
             {},
-            (x[0], x[0]),
+            (x[0], x[0], zero, zero),
             frozenset(),
         )[0]
 

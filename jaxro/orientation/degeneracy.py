@@ -26,6 +26,17 @@ POWERS = 4
 """Of the cofactor matrix: enough to separate its largest eigenvalue where that
 matters."""
 
+NEAR_STATION = 2.0
+"""Standard deviations of the image of the other station within which a point says
+little of what its own errors do to the normal equations."""
+
+FREE = 5.0
+"""Multiple of sigma0 from which a `margin` leaves the cofactors as they are."""
+
+MOST_LOST = 0.9
+"""Part of the information that errors may feign, at most: beyond, nothing is
+determined."""
+
 
 def in_radians(
     elements: AbstractElements, cofactor: Float[Array, "5 5"]
@@ -48,24 +59,33 @@ class WorstDirection(NamedTuple):
     units of sigma) that leaves one combination of the elements undetermined, to first
     order. And to second order, of another minimum: `away`, its distance in standard
     deviations of the direction for sigma0 = 1; `turn`, the same in rad; `rise` of Σ r²
-    there.
+    there. `cofactor`: those of the elements, with what the errors of the points add to
+    the normal equations along the direction taken off.
     """
 
     margin: Float[Array, ""]
+    cofactor: Float[Array, "5 5"]
     away: Float[Array, ""]
     turn: Float[Array, ""]
     rise: Float[Array, ""]
 
 
 def worst_direction(
-    pair: Pair, elements: AbstractElements, cofactor: Float[Array, "5 5"]
+    pair: Pair,
+    elements: AbstractElements,
+    cofactor: Float[Array, "5 5"],
+    sigma0: Float[Array, ""],
 ) -> WorstDirection:
     """`WorstDirection` of an adjustment with these cofactors of its parameters.
 
     Along the worst determined direction e of the elements g of a point changes by g'.
     With n points the normal matrix has eᵀ N e = Σ (g'/ (sigma |∇g|))², and each
     coordinate moves g' by ∇g', so that errors of size m alone produce m² Σ (|∇g'| /
-    |∇g|)²: the two are equal at m = margin.
+    |∇g|)²: the two are equal at m = margin. So of eᵀ N e only the part 1 - m² / margin²
+    is information; the gradient of Σ r² varies by the whole. Along e the variance is
+    that of the inverse over the square of this part. A point so near to the other
+    station's image that the uncertain direction may move that image past it tells
+    nothing of the others' errors, and counts less the nearer it is.
 
     To second order the residuals are r + a t + c t²/2 with a = A e at right angles to
     all other columns of A and c = (g'' - 2 g' ∇g.∇g' / |∇g|²) / (sigma |∇g|), but for
@@ -75,9 +95,9 @@ def worst_direction(
     through both stations, have there another minimum that the linearised statistics of
     the first know nothing of.
     """
-    direction = direction_of_worst(elements, cofactor)
+    direction, variance = direction_of_worst(elements, cofactor)
     matrices = _bend(pair, elements, direction)
-    bent = _sum_along(pair, *matrices)
+    bent = _sum_along(pair, *matrices, variance * sigma0**2)
 
     columns = _along_columns(pair, elements, bent.by_entry)  # Aᵀc
     taken = quadratic([list(row) for row in cofactor], columns)
@@ -85,8 +105,12 @@ def worst_direction(
     straight = back <= 0
     turn = 2 * bent.change / jnp.where(straight, 1.0, back)
     turn = jnp.where(straight, jnp.inf, turn)
+    margin = _margin(bent.told, bent.drift)
+    e = jnp.stack(direction)
+    more = _lost_information(margin, sigma0) * variance
     return WorstDirection(
-        margin=_margin(bent.change, bent.drift),
+        margin=margin,
+        cofactor=cofactor + more * e[:, None] * e[None, :],
         away=turn * jnp.sqrt(jnp.maximum(bent.change, 0.0)),
         turn=turn,
         rise=jnp.maximum(bent.bends - taken, 0.0) * turn**4 / 4,
@@ -94,38 +118,66 @@ def worst_direction(
 
 
 def margin_along(
-    pair: Pair, elements: AbstractElements, direction: list
+    pair: Pair,
+    elements: AbstractElements,
+    direction: list,
+    variance: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """The `margin` of `WorstDirection`, along any direction of the elements."""
+    """The `margin` of `WorstDirection`, along any direction of the elements with this
+    variance."""
     f, slope, _ = _bend(pair, elements, direction)
 
     def of_point(point, sigma, use, roots):
         _, square, _ = coplanarity.linearise(f, point, use, roots)
         g, drift, _ = coplanarity.linearise(slope, point, use, roots)
-        weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
+        heard = _heard(square, drift, variance)
+        weight = jnp.where(use, heard / (square * sigma**2), 0.0)
         return g**2 * weight, drift * sigma**2 * weight
 
     measured = pair.coordinates, pair.sigma, pair.mask, pair.roots
     return _margin(*sums(jax.vmap(of_point)(*measured)))
 
 
-def _margin(change: Float[Array, ""], drift: Float[Array, ""]) -> Float[Array, ""]:
+def _heard(
+    square: Float[Array, ""], drift: Float[Array, ""], variance: Float[Array, ""]
+) -> Float[Array, ""]:
+    """How much a point tells of the errors along a direction with this variance: the
+    less, the more of its gradient, of which these are the squares, may change."""
+    square = jnp.where(square > 0, square, 1.0)
+    return 1 / (1 + (NEAR_STATION**2 * variance * drift / square) ** 2)
+
+
+def _margin(told: Float[Array, ""], drift: Float[Array, ""]) -> Float[Array, ""]:
     """The errors of the coordinates at which the drift that they cause is as large as
-    the change."""
-    ratio = change / jnp.where(drift > 0, drift, 1.0)
+    what is told."""
+    ratio = told / jnp.where(drift > 0, drift, 1.0)
     reach = jnp.sqrt(jnp.where(ratio > 0, ratio, 0.0))
     return jnp.where(drift > 0, reach, jnp.inf)
 
 
+def _lost_information(
+    margin: Float[Array, ""], sigma0: Float[Array, ""]
+) -> Float[Array, ""]:
+    """By how much the variance along a direction exceeds the one of the inverse, over
+    this: nothing from a margin of `FREE`, where the layout is far from undetermined,
+    and without limit where the errors are all there is."""
+    part = (sigma0 / jnp.where(margin > 0, margin, 1.0)) ** 2
+    part = jnp.where(margin > 0, part, 1.0)
+    lost = jnp.clip(part - 1 / FREE**2, 0.0, MOST_LOST)
+    return 1 / (1 - lost) ** 2 - 1
+
+
 def direction_of_worst(
     elements: AbstractElements, cofactor: Float[Array, "5 5"]
-) -> list:
-    """The worst determined direction, of length 1 in rad, in the units of the
-    elements."""
+) -> tuple[list, Float[Array, ""]]:
+    """The worst determined direction, of length 1 in rad, in the units of the elements;
+    and its variance (rad²) for sigma0 = 1."""
     in_rad, units = in_radians(elements, cofactor)
     direction = _worst(in_rad)
     length = jnp.sqrt(sum((e * e for e in direction), jnp.zeros(())))
-    return [e / length * unit for e, unit in zip(direction, units, strict=True)]
+    direction = [e / length for e in direction]
+    variance = quadratic([list(row) for row in in_rad], direction)
+    return [e * unit for e, unit in zip(direction, units, strict=True)], variance
 
 
 def _bend(pair: Pair, elements: AbstractElements, direction: list) -> tuple:
@@ -148,37 +200,44 @@ def _bend(pair: Pair, elements: AbstractElements, direction: list) -> tuple:
 
 
 class _Bent(NamedTuple):
-    """Sums over the points, with the weights w = 1 / (sigma |∇g|)²: `change` Σ w g'²,
-    `drift` Σ w sigma² |∇g'|², `bends` Σ c² and, by the entries of F, Σ c ∂g/∂F times
-    the root of w."""
+    """Sums over the points, with the weights w = 1 / (sigma |∇g|)² and the part h of
+    `_heard`: `change` Σ w g'², `told` Σ h w g'², `drift` Σ h w sigma² |∇g'|², `bends`
+    Σ (h c)² and, by the entries of F, Σ h c ∂g/∂F times the root of w."""
 
     change: Float[Array, ""]
+    told: Float[Array, ""]
     drift: Float[Array, ""]
     bends: Float[Array, ""]
     by_entry: rot.Matrix
 
 
 def _sum_along(
-    pair: Pair, f: rot.Matrix, slope: rot.Matrix, curve: rot.Matrix
+    pair: Pair,
+    f: rot.Matrix,
+    slope: rot.Matrix,
+    curve: rot.Matrix,
+    variance: Float[Array, ""],
 ) -> _Bent:
-    """The sums for F and its derivatives along a direction."""
+    """The sums for F and its derivatives along a direction with this variance."""
 
     def of_point(point, sigma, use, roots):
         _, square, b = coplanarity.linearise(f, point, use, roots)
         g, drift, turned = coplanarity.linearise(slope, point, use, roots)
         weight = jnp.where(use, 1 / (square * sigma**2), 0.0)
         steepens = sum(x * y for x, y in zip(b, turned, strict=True)) / square
-        bent = coplanarity.condition(curve, point) - 2 * g * steepens
+        heard = _heard(square, drift, variance)
+        bent = heard * (coplanarity.condition(curve, point) - 2 * g * steepens)
         by_f = sum(jax.grad(coplanarity.condition)(f, point), ())
-        own = g**2 * weight, drift * sigma**2 * weight, bent**2 * weight
+        told = g**2 * heard * weight, drift * sigma**2 * heard * weight
+        own = g**2 * weight, *told, bent**2 * weight
         return *own, *(bent * weight * entry for entry in by_f)
 
     measured = pair.coordinates, pair.sigma, pair.mask, pair.roots
     of_points = jax.vmap(of_point)(*measured)
-    change, drift, bends, *products = sums(of_points)
+    change, told, drift, bends, *products = sums(of_points)
     p11, p12, p13, p21, p22, p23, p31, p32, p33 = products
     by_entry = (p11, p12, p13), (p21, p22, p23), (p31, p32, p33)
-    return _Bent(change=change, drift=drift, bends=bends, by_entry=by_entry)
+    return _Bent(change, told, drift, bends, by_entry)
 
 
 def _along_columns(
@@ -273,15 +332,15 @@ def noise(
 
 
 def required_margin(freedom: Float[Array, ""]) -> Float[Array, ""]:
-    """Multiple of sigma0 below which a `margin` is not told from measuring errors: 2,
-    and more where sigma0 itself is uncertain, having few degrees of freedom (64 with
+    """Multiple of sigma0 below which a `margin` is not told from measuring errors: 1.25,
+    and more where sigma0 itself is uncertain, having few degrees of freedom (63 with
     one).
 
-    The errors alone give points that determine nothing a margin of 1. Of 150 points
-    with margins of 2 to 3 the 95 % regions hold 93 % of the poses, as those with any
-    larger margin do; with 1.6 to 2 they hold 89 %, with 1.3 80 %.
+    The errors alone give points that determine nothing a margin of 1, and to one in
+    fifty of those on a line one of more than 1.25 with a hundred points, of more than 2
+    with twenty. What is above is usable with the deviation that it has.
     """
-    return 2 + 62 / jnp.maximum(freedom, 1.0)
+    return 1.25 + 62 / jnp.maximum(freedom, 1.0) ** 1.3
 
 
 def significant(freedom: Float[Array, ""]) -> Float[Array, ""]:

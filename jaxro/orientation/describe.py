@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment.guarded import root
@@ -12,7 +13,7 @@ from ..geometry.intersection import model_point
 from ..geometry.pairs import Pair
 from ..xla.passes import pointwise, sums
 from . import chosen_elements, degeneracy
-from .degeneracy import Noise
+from .degeneracy import Noise, WorstDirection
 from .inspection import Inspection, inspect
 from .problem import Problem
 from .solve import Solution
@@ -20,7 +21,8 @@ from .solve import Solution
 
 class Description(NamedTuple):
     """`pose`: with the base on the side of the points. `elements` and `cofactor`: in
-    the system that was asked for, whose base has the length `length`. `inspection`:
+    the system that was asked for, whose base has the length `length`. `worst`: the
+    direction of the parameters that were solved that is determined worst. `inspection`:
     what the points tell of the pose; `noise`: the measuring errors that layouts are
     judged by. `sigma0`: the estimated one, zero without redundancy. Of every point:
     `parallax`, `model`, `in_front`. `m_q`: the mean parallax. `behind`: how many
@@ -30,6 +32,7 @@ class Description(NamedTuple):
     elements: AbstractElements
     cofactor: Float[Array, "5 5"]
     length: Float[Array, ""]
+    worst: WorstDirection
     inspection: Inspection
     noise: Noise
     sigma0: Float[Array, ""]
@@ -49,15 +52,19 @@ def describe(pair: Pair, problem: Problem, solution: Solution) -> Description:
     free = isinstance(solved, RelativePose)
     pose, flipped = chosen_elements.face_points(pose, inspection, free)
     length = chosen_elements.length(pair, problem.elements, problem.length, pose)
-    elements, cofactor = chosen_elements.in_system(
-        solved, adjustment.cofactor, flipped, problem.elements, length
-    )
-
     freedom = adjustment.degrees_of_freedom
     checked = freedom > 0
     sigma0 = jnp.where(checked, adjustment.sigma0, 0.0)
     noise = degeneracy.noise(
         sigma0, freedom.astype(sigma0.dtype), inspection.sigma, pair.focal_left
+    )
+
+    # what errors add to the information has no derivative: the rest of it has
+    fixed = lax.stop_gradient((pair, solved, adjustment.cofactor, noise.size))
+    worst = degeneracy.worst_direction(*fixed)
+    cofactor = adjustment.cofactor + (worst.cofactor - fixed[2])
+    elements, cofactor = chosen_elements.in_system(
+        solved, cofactor, flipped, problem.elements, length
     )
 
     parallax_of = coplanarity.parallax_of(pair, pose)
@@ -78,6 +85,7 @@ def describe(pair: Pair, problem: Problem, solution: Solution) -> Description:
         elements=elements,
         cofactor=cofactor,
         length=length,
+        worst=worst,
         inspection=inspection,
         noise=noise,
         sigma0=sigma0,

@@ -58,7 +58,7 @@ def orient(
     bx of a known start, or the mean x-parallax. `RelativePose` has a unit base whatever
     is given. `residual`: `coplanarity.rigorous` or `coplanarity.parallax`. `start`: an
     object of `starts`, or known elements, which are then also the parameters that are
-    iterated. `max_steps`: 30 if not given, 300 with a loss, whose reweighted steps
+    iterated. `max_steps`: 60 if not given, 300 with a loss, whose reweighted steps
     converge linearly. Works under jit, vmap and grad; failures are values of `result`.
     """
     if pair.x_left.ndim != 1:

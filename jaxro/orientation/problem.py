@@ -26,7 +26,7 @@ class Problem(NamedTuple):
     """`elements`: the system of the result. `base`: its given length, if any.
     `residual`: what is minimised, a `Term` of the pair. `loss`: a robust loss in place
     of the sum of squares. `start`: where to begin, a start or known elements. `solver`:
-    that of the engine, if None. `max_steps`: 30 if None, 300 with a loss, whose
+    that of the engine, if None. `max_steps`: 60 if None, 300 with a loss, whose
     reweighted steps converge linearly. `tolerance`: steps (rad) below it end the
     adjustment; with TOLERANCE a pair alone and in a batch, begun here or there, ends at
     the same numbers.
@@ -46,7 +46,7 @@ class Problem(NamedTuple):
         """Steps that are allowed."""
         if self.max_steps is not None:
             return self.max_steps
-        return 30 if self.loss is None else 300
+        return 60 if self.loss is None else 300
 
     @property
     def length(self) -> Array | None:

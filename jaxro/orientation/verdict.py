@@ -11,7 +11,6 @@ from ..geometry.elements import AbstractElements
 from ..geometry.pairs import Pair, mask_unusable
 from ..xla.passes import total
 from . import chosen_elements, degeneracy, planes
-from .degeneracy import WorstDirection
 from .describe import Description
 from .problem import Problem
 from .result import Orientation
@@ -38,11 +37,13 @@ def verdict(
     freedom = adjustment.degrees_of_freedom
     solved = adjustment.result == results.RESULTS.successful
 
-    weakest = largest_variance(adjustment.parameters, adjustment.cofactor)
-    direction = degeneracy.worst_direction(
-        pair, adjustment.parameters, adjustment.cofactor
-    )
-    second, undivided = degeneracy.find_second(direction, noise)
+    worst = description.worst
+    weakest = largest_variance(adjustment.parameters, worst.cofactor)
+    deviates = noise.size**2 * weakest > WEAK**2
+    undetermined = worst.margin < noise.least_margin
+    # the nearer to that, the slower
+    ended = solved | (adjustment.result == results.RESULTS.diverged)
+    second, undivided = degeneracy.find_second(worst, noise)
     rotation = degeneracy.pure_rotation(
         description.inspection, noise.freedom, description.sigma0
     )
@@ -53,7 +54,7 @@ def verdict(
         (RESULTS.zero_base, rotation | start.pure_rotation),
         (
             RESULTS.weakly_determined,
-            solved & (_is_weak(weakest, direction, description) | undivided),
+            (solved & (deviates | undivided)) | (ended & undetermined),
         ),
         (
             RESULTS.elements_undefined,
@@ -78,15 +79,6 @@ def largest_variance(
 ) -> Float[Array, ""]:
     """The largest cofactor of an element in rad, of the base over its length."""
     return jnp.max(jnp.diagonal(degeneracy.in_radians(elements, cofactor)[0]))
-
-
-def _is_weak(
-    weakest: Float[Array, ""], direction: WorstDirection, description: Description
-) -> Bool[Array, ""]:
-    """Whether the points determine the pose too weakly for their errors."""
-    noise = description.noise
-    deviates = noise.size**2 * weakest > WEAK**2
-    return deviates | (direction.margin < noise.least_margin)
 
 
 def _lack_elements(

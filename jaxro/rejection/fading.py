@@ -20,7 +20,8 @@ from ..adjustment import losses, m_estimates
 from ..adjustment.normal_equations import dense, inverse
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearise
-from ..geometry.pairs import Pair
+from ..geometry.pairs import Pair, mask_unusable
+from ..orientation import degeneracy
 from ..orientation.orient import Orientation
 from ..xla.kernels import if_needed
 from ..xla.passes import count
@@ -79,11 +80,20 @@ class Fading(NamedTuple):
         found = if_needed(self.needed, estimate, m_estimates.Spread(one, one))
         ratio = jnp.where(self.needed, found.sigma0 / solved.sigma0, 1.0)
         plain = self._plain_cofactor(pair, use, solved.pose)
+
+        def of_errors(needed: Bool[Array, ""]) -> Float[Array, "5 5"]:
+            used = mask_unusable(pair.with_mask(use & needed))[0]
+            fixed = lax.stop_gradient((used, solved.pose, plain, found.sigma0))
+            return degeneracy.worst_direction(*fixed).cofactor - fixed[2]
+
+        more = if_needed(self.needed, of_errors, jnp.zeros_like(plain))
         return dataclasses.replace(
             solved,
             # the value of the M-estimate, the derivative of the last solution
             sigma0=solved.sigma0 * lax.stop_gradient(ratio),
-            cofactor=jnp.where(self.needed, found.factor * plain, solved.cofactor),
+            cofactor=jnp.where(
+                self.needed, found.factor * (plain + more), solved.cofactor
+            ),
         )
 
     def _plain_cofactor(

@@ -235,7 +235,9 @@ def test_sound_layouts_are_not_refused(kind):
 def test_margin_of_an_undetermined_layout_is_its_measuring_error(kind, sigma):
     """Every zone measured twice, two zones empty: what determines the elements is the
     error of the points alone."""
-    margins = worst(batches()[kind], found()[kind].pose, found()[kind].cofactor).margin
+    found_of = found()[kind]
+    noise = np.full(len(found_of.usable), sigma)
+    margins = worst(batches()[kind], found_of.pose, found_of.cofactor, noise).margin
     assert 0.5 < np.median(margins) / sigma < 1.5
 
 
