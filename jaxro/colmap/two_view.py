@@ -21,6 +21,7 @@ from .database import Geometry, Matches
 CONFIG = {
     Kind.oriented: 2,
     Kind.plane: 4,
+    Kind.two_poses: 4,
     Kind.rotation: 5,
     Kind.weak: 2,
     Kind.no_consensus: 1,
@@ -30,14 +31,15 @@ CONFIG = {
 
 CONTENT = {
     Kind.oriented: ("F", "E", "qvec", "tvec"),
-    Kind.plane: ("F", "E", "H"),
+    Kind.plane: ("F", "E", "H", "qvec", "tvec"),
+    Kind.two_poses: ("F", "E", "H"),
     Kind.rotation: ("H", "qvec", "tvec"),
     Kind.weak: ("F", "E"),
     Kind.no_consensus: (),
     Kind.too_few: (),
 }
-"""What is written of a pair besides its matches: no pose of a plane, which may have
-two, nor where the base is too short for its errors."""
+"""What is written of a pair besides its matches: no pose where the matches have two, nor
+where the base is too short for its errors."""
 
 Matrices = Float[np.ndarray, "pair 3 3"]
 

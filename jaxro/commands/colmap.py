@@ -21,7 +21,8 @@ from ..xla.slabs import Progress, silent
 
 MEANING = {
     Kind.oriented: ("oriented", "CALIBRATED, with relative pose"),
-    Kind.plane: ("plane scene", "PLANAR, without pose: a plane may have two"),
+    Kind.plane: ("plane scene", "PLANAR, with relative pose"),
+    Kind.two_poses: ("two poses", "PLANAR, without pose: two explain the matches"),
     Kind.rotation: ("pure rotation", "PANORAMIC, the base is zero"),
     Kind.weak: ("weak", "CALIBRATED, without pose: base too short for its errors"),
     Kind.no_consensus: (
@@ -30,7 +31,7 @@ MEANING = {
     ),
     Kind.too_few: ("too few", "DEGENERATE, no matches: fewer than six"),
 }
-GOOD = (Kind.oriented, Kind.plane, Kind.rotation)
+GOOD = (Kind.oriented, Kind.plane, Kind.two_poses, Kind.rotation)
 
 
 @dataclass(frozen=True)

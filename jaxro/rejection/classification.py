@@ -1,27 +1,17 @@
 """What the orientation of an image pair from its automatic matches is worth.
 
-Pose and kept matches come from the procedure `recommended` and stay unchanged if the
-pair is `oriented`. Here they are classified:
-
-1. Where most matches lie in one plane, they have a second pose (`planes`), which
-   replaces the first one if it has more of them in front of both photos.
-2. Where the rotation alone explains the matches, there is no base, and whatever base
-   was found is an accident.
-3. Matches that repeat others are no evidence, and of automatic matches some are wrong
-   from the start: that all of them fit proves nothing if they are few. The kept set is
-   believed if sets as good are not expected by accident (`rejection.evidence`), by the
-   share of matches that agree when every point is given the partner of another one.
+Pose, matches kept and whether they are believed are those of the procedure
+`recommended`, which decides here as it does everywhere. This module only gives its
+verdict the names that programs for images use, with what they want to know besides: the
+rotation where there is no base, and the plane nearest to the matches.
 """
 
 import enum
-import math
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment import critical_values
@@ -31,45 +21,32 @@ from ..geometry.pairs import Pair, mask_unusable
 from ..orientation import planes
 from ..orientation.results import RESULTS, is_usable
 from ..orientation.starts.general import rotation_only, vectors
-from ..xla.kernels import while_loop
 from ..xla.passes import count, total
-from . import OUTCOMES, Recommended, Rejection, evidence
-from .agreement import keep_agreeing, squares
-from .visibility import look, seen
+from . import OUTCOMES, Recommended, Rejection
+from .agreement import points_within, squares
+from .masked import choose
 
 ENGINE = Recommended()
 """The procedure that decides on pose and matches; the standard deviations are those of
 the matches."""
 
-ACCIDENTS = 1e-3
-"""Sets as good that may be expected by accident: as many as the engine allows."""
-
-ROUNDS = 10
-"""Largest number of turns (solve, judge every match) for the second pose of a plane
-scene."""
-
-TURNS = 3
-"""Turns to find the rotation without a base: each one uses the matches that the last
-rotation explains."""
-
-ALIKE, CHANCE = 3.0, 0.05
-"""Where there is no base: number of wrong matches that agree on any base, and the share
-of the other wrong matches that agree with it by chance."""
 
 PLANE = 0.8
-"""If at least this share of the matches that agree with a pose lies in one plane, only
-the plane determines the pose."""
+"""If at least this share of the matches that agree with a pose lies in one plane, it is
+that of a plane scene."""
 
 
 class Kind(enum.IntEnum):
-    """How the orientation of a pair from its matches ended."""
+    """How the orientation of a pair from its matches ended; `two_poses`: of a plane, both
+    of which explain the matches."""
 
     oriented = 0
     plane = 1
-    rotation = 2
-    weak = 3
-    no_consensus = 4
-    too_few = 5
+    two_poses = 2
+    rotation = 3
+    weak = 4
+    no_consensus = 5
+    too_few = 6
 
 
 class Found(eqx.Module):
@@ -96,16 +73,6 @@ class Verdict(NamedTuple):
     outcome: OUTCOMES
 
 
-class Plane(NamedTuple):
-    """The pose of most matches in front of both photos, its matches, the plane nearest
-    to them, and whether that plane alone determines the pose."""
-
-    pose: RelativePose
-    use: Bool[Array, "match"]
-    normal: Float[Array, "3"]
-    alone: Bool[Array, ""]
-
-
 def verdict(rejection: Rejection) -> Verdict:
     """The part of a rejection that is needed here."""
     solved = rejection.orientation
@@ -115,32 +82,28 @@ def verdict(rejection: Rejection) -> Verdict:
 def classify(pair: Pair, verdict: Verdict) -> Found:
     """The kind of a pair, from the verdict of the engine on it."""
     pair = mask_unusable(pair)[0]
-    each = lambda n: critical_values.normal(ENGINE.level / np.maximum(n, 1.0))
-    limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
-    plane = in_plane(pair, verdict.pose, verdict.mask, limit)
-    pose, use, turned = without_base(pair, plane.pose, plane.use, verdict.result, limit)
-    weak = (verdict.result == RESULTS.weakly_determined) | (
-        verdict.result == RESULTS.carried_by_few
+    result, outcome, use = verdict.result, verdict.outcome, verdict.mask
+    believed = (
+        (outcome == OUTCOMES.finished)
+        | (outcome == OUTCOMES.undecided)
+        | (outcome == OUTCOMES.not_oriented)
     )
-    # the other pose of a plane, which explains the matches as well
-    either = plane.alone | (verdict.result == RESULTS.two_solutions)
-    # matches behind a photo are here infinitely far within their errors
-    fair = (
-        is_usable(verdict.result)
-        | weak
-        | (verdict.result == RESULTS.points_behind_camera)
-    )
-    # without a base any base is as good as another one, so that the engine may doubt
-    # the base that it found
-    convinced = turned | (fair & (verdict.outcome != OUTCOMES.no_consensus))
-    kind = jnp.where(either, int(Kind.plane), int(Kind.oriented))
+    plane = _plane(pair, verdict.pose, use)
+    turned = result == RESULTS.zero_base
+    weak = (result == RESULTS.weakly_determined) | (result == RESULTS.carried_by_few)
+    usable = is_usable(result)
+    kind = jnp.where(usable, int(Kind.oriented), int(Kind.no_consensus))
     for holds, other in (
-        (weak & ~either, Kind.weak),
+        (usable & (plane.share >= PLANE), Kind.plane),
+        (result == RESULTS.two_solutions, Kind.two_poses),
+        (weak, Kind.weak),
         (turned, Kind.rotation),
-        (~convinced | ~certain(pair, pose, use, limit), Kind.no_consensus),
+        (~believed, Kind.no_consensus),
         (count(pair.mask) < 6, Kind.too_few),
     ):
         kind = jnp.where(holds, int(other), kind)
+    rotation, _ = rotation_only(*vectors(pair), use)
+    pose = choose(turned, rotation, verdict.pose)
     return Found(
         kept=use & (kind < int(Kind.no_consensus)),
         quaternion=pose.quaternion,
@@ -152,69 +115,11 @@ def classify(pair: Pair, verdict: Verdict) -> Found:
     )
 
 
-def in_plane(
-    pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit: Float[Array, ""]
-) -> Plane:
-    """Whether most matches lie in one plane. If they do, a second pose explains them,
-    too; it replaces the first pose if it has more matches in front of both photos."""
-    # matches that were rejected for lying behind a photo agree, too
-    agree = use | (pair.mask & (squares(pair, pose) <= limit**2))
-    flat = planes.plane(pair, pose, agree, limit)
-    alone = flat.share >= PLANE
-
-    def once(state):
-        needed, first = state
-        # depends on the round, or it would be computed of every scene
-        inside = mask_unusable(pair.with_mask(pair.mask & needed))[0]
-        in_it = inside.with_mask(inside.mask & flat.within)
-        other, exists = planes.second(in_it, pose, flat.normal)
-        in_front = lambda pose: count(flat.within & look(inside, pose).in_front)
-        more = in_front(other) > in_front(pose)
-        other, others = keep_agreeing(inside, other, in_it.mask, limit, ROUNDS)
-        others = others & seen(inside, other, limit)
-        normal = planes.plane(inside, other, others, limit).normal
-        new = Plane(other, others, normal, alone)
-        replace = lambda a, b: jnp.where(needed & exists & more, a, b)
-        return needed & False, jax.tree.map(replace, new, first)
-
-    first = Plane(pose, use, flat.normal, alone)
-    return while_loop(lambda state: state[0], once, (alone, first), pair.focal_left)[1]
-
-
-def without_base(
-    pair: Pair,
-    pose: RelativePose,
-    use: Bool[Array, "match"],
-    result: RESULTS,
-    limit: Float[Array, ""],
-) -> tuple[RelativePose, Bool[Array, "match"], Bool[Array, ""]]:
-    """The rotation without a base and its matches where it explains the matches in use,
-    and whether it does."""
-    # a large sigma0 may hide a base, therefore the rays themselves have to be parallel
-    # after the rotation. Without a base the engine finds one that some wrong matches
-    # agree on: their parallaxes do not prove it
-    rotated_by = lambda still: rotation_only(*vectors(pair), use & still)[0]
-    turns = lambda _, still: look(pair, rotated_by(still), limit).parallel
-    still = lax.fori_loop(0, TURNS, turns, pair.mask)
-    rotated = rotated_by(still)
-    few = count(use & ~still) <= ALIKE + CHANCE * count(pair.mask & ~still)
-    most = count(use & still) >= PLANE * count(use)
-    turned = ((result == RESULTS.zero_base) | few) & most
-    choose = lambda a, b: jnp.where(turned, a, b)
-    return *jax.tree.map(choose, (rotated, still), (pose, use)), turned
-
-
-def certain(
-    pair: Pair, pose: RelativePose, use: Bool[Array, "match"], limit: Float[Array, ""]
-) -> Bool[Array, ""]:
-    """Whether so many matches at different places are not expected to agree by
-    accident."""
-    once = mask_unusable(pair.with_mask(evidence.apart(pair)))[0]
-    agreed, asked = evidence.shifted_agreement(once, pose, limit)
-    chance = (agreed + 1) / (asked + 2)
-    return evidence.log_accidents(
-        chance, count(once.mask), count(use & once.mask)
-    ) <= math.log(ACCIDENTS)
+def _plane(pair: Pair, pose: RelativePose, use: Bool[Array, "match"]) -> planes.Plane:
+    """The plane nearest to the matches that agree with a pose, be they in use or not."""
+    each = lambda n: critical_values.normal(ENGINE.level / np.maximum(n, 1.0))
+    limit = critical_values.by_count(each, pair.x_left.shape[0], count(pair.mask))
+    return planes.plane(pair, pose, use | points_within(pair, pose, limit), limit)
 
 
 def sigma0(
