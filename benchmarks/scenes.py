@@ -690,6 +690,63 @@ def _depths_of(rng: np.random.Generator, kind: str, left: Array, focal: float) -
 
 
 # ------------------------------------------------------------------------------------
+# forward facades
+
+FORWARD_BASE = (0.5, 0.0, -1.0)
+"""Towards a facade FACADE_DISTANCE away with this relief, as a part of the distance."""
+
+FACADE_DISTANCE, FACADE_RELIEF = 20.0, 0.05
+
+
+FORWARD_POINTS = 600
+
+
+def forward_facades(pairs: int, wrong: float, *, seed: int = 0) -> Scenes:
+    """Pairs of photographs that walk towards a facade: f 2,000 px, errors of 0.4 px, and
+    a share of wrong matches anywhere in the other photo.
+
+    The other station's image lies at the edge of the photo, and the facade is nearly
+    plane: the base is determined to some tenths of a degree.
+    """
+    begin = [seed, round(1000 * wrong)]
+    parts = [
+        _forward(np.random.default_rng([*begin, number]), wrong)
+        for number in range(pairs)
+    ]
+    fields = zip(*parts, strict=True)
+    return Scenes(*(np.stack([np.asarray(v) for v in field]) for field in fields))
+
+
+def _forward(rng: np.random.Generator, wrong: float) -> tuple:
+    """The fields of one pair."""
+    focal, sigma, points = 2000.0, 0.4, FORWARD_POINTS
+    photo = Photo(focal, 1000.0, 750.0)
+    left = photo.uniform(rng, points)
+    relief = 1 + FACADE_RELIEF * rng.uniform(-1, 1, points)
+    space = rays(left, focal) / focal * (FACADE_DISTANCE * relief)[:, None]
+    rotation = turn(direction(rng), rng.normal(0, 0.05))
+    station = np.array(FORWARD_BASE)
+    right, _ = project(space, rotation, station, focal)
+    good = np.arange(points) >= round(wrong * points)
+    right = np.where(good[:, None], right, photo.uniform(rng, points))
+    left, right = (p + rng.normal(0, sigma, p.shape) for p in (left, right))
+    base = station / np.linalg.norm(station)
+    near = np.abs(sampson(left, right, focal, rotation, base))
+    return (
+        *left.T,
+        *right.T,
+        np.ones(points, bool),
+        good,
+        ~good & (near <= UNDECIDABLE * sigma),
+        focal,
+        sigma,
+        rotation,
+        base,
+        True,
+    )
+
+
+# ------------------------------------------------------------------------------------
 # repeated facades
 
 FACADES = ("none", "beside", "among")

@@ -77,13 +77,20 @@ PARALLEL = 3.5
 class Witnesses(NamedTuple):
     """What is to be said of a base: that a rotation explains the others (`turned`),
     that few points carry it (`few`), or that the other pose of a plane explains the
-    others (`second`); the `rotation`, and the points that it explains."""
+    others (`second`); the `rotation`, and the points that it explains; the `chance`
+    that a wrong point agrees."""
 
     turned: Bool[Array, ""]
     few: Bool[Array, ""]
     second: Bool[Array, ""]
     rotation: RelativePose
     still: Use
+    chance: Float[Array, ""]
+
+    @property
+    def carried(self) -> Bool[Array, ""]:
+        """Whether the base is one, and many points carry it."""
+        return ~(self.turned | self.few)
 
     def judge(self, orientation: Orientation) -> Orientation:
         """The orientation with what the witnesses say, where it is else successful or
@@ -106,7 +113,7 @@ def witnesses(
     """`Witnesses` of the base of a pose by the points in use, where they are `asked`;
     `pair` without unusable points, with the sigma that the points were judged by."""
     no = asked & False
-    silent = Witnesses(no, no, no, pose, use)
+    silent = Witnesses(no, no, no, pose, use, jnp.ones_like(limit))
     ask = lambda asked: _ask(
         pair.with_mask(pair.mask & asked), pose, use & asked, limit
     )
@@ -143,6 +150,7 @@ def _ask(
         second=flat & chosen & any_out,
         rotation=rotation,
         still=still,
+        chance=chance,
     )
 
 
@@ -150,14 +158,19 @@ def _points_of_other_pose(
     pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]
 ) -> tuple[Use, Bool[Array, ""]]:
     """The points that agree with the other pose of the plane of those in use, and
-    whether there is one, and enough points lie in the plane."""
+    whether there is one, enough points lie in the plane, and those that agree with both
+    fit it as well."""
     plane = planes.plane(pair, pose, use, limit)
     in_plane = mask_unusable(pair.with_mask(plane.within))[0]
     other, exists = planes.second(in_plane, pose, plane.normal)
     other = narrow(pair, other, WIDE * limit)
     near = points_within(pair, other, limit)
     other, agree = keep_agreeing(pair, other, near, limit, ROUNDS)
-    return agree & seen(pair, other, limit), exists & (plane.share >= FLAT)
+    agree = agree & seen(pair, other, limit)
+    both = use & agree
+    here, there = (sum_of(squares(pair, p), both) for p in (pose, other))
+    fits = there <= here * degeneracy.excess(count(both) - 5)
+    return agree, exists & (plane.share >= FLAT) & fits
 
 
 def turn_only(pair: Pair, use: Use) -> tuple[RelativePose, Use]:
@@ -222,8 +235,10 @@ def carriers(
         weight = jnp.where(left, linear.weight, 0.0)
         n, _ = normal_equations(linear, weight)
         cofactor = dense(inverse(n)[0])
-        direction = degeneracy.direction_of_worst(pose, cofactor)
-        margin = degeneracy.margin_along(pair.with_mask(left), pose, direction)
+        direction, variance = degeneracy.direction_of_worst(pose, cofactor)
+        margin = degeneracy.margin_along(
+            pair.with_mask(left), pose, direction, variance * sigma0**2
+        )
         deviation = sigma0 * jnp.sqrt(largest_variance(pose, cofactor))
         first = count(left) >= count(use) - FEW
         weak = first & (deviation > WEAK)

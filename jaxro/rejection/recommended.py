@@ -36,6 +36,7 @@ from .masked import Use, choose
 from .quick import Plain, Quick
 from .stages import FEW, AbstractStage, scale_sigma
 from .thorough import Thorough
+from .unchecked import without_unchecked
 from .verdict import verdict
 from .visibility import seen
 
@@ -145,6 +146,9 @@ class Recommended(AbstractProcedure):
         base = witnesses(fixed, pose, use, believed, limit)
         use = jnp.where(base.turned, base.still, use)
         pose = choose(base.turned, base.rotation, pose)
+        pose, use = without_unchecked(
+            fixed, pose, use, limit, base.chance, believed & base.carried
+        )
         w = normalised_residuals(linearise(fixed, pose), use)
         fading = fade(scale_sigma(pair, scale), pose, use & believed)
         fading = fading._replace(noise=fading.noise * scale)

@@ -286,8 +286,9 @@ def _settle_better_pose(
     out, of the plane's two poses the one that costs less."""
 
     def cost(pose: RelativePose, use: Use) -> Float[Array, ""]:
-        each = jnp.where(use, squares(pair, pose), limit**2)
-        return sum_of(each, pair.mask)
+        # a point that nothing checks may be in use far from the pose that it pulls
+        each = jnp.minimum(squares(pair, pose), limit**2)
+        return sum_of(jnp.where(use, each, limit**2), pair.mask)
 
     def turn(state: Settled) -> Settled:
         new = settle(pair.with_mask(pair.mask & state.again), state.start, limit)

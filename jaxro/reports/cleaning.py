@@ -79,6 +79,17 @@ def _show_rejections(
     )
     console.print(rows)
     left_out(console, len(rejected), "rejections")
+    unchecked = rejected[verdicts.fits[rejected]]
+    if unchecked.size:
+        points = verdicts.table.points[unchecked]
+        owners = verdicts.table.names[owner[unchecked]]
+        named = [f"{a} {b}" for a, b in zip(owners, points, strict=True)]
+        listed = join_names(named if many else list(points), most_rows())
+        console.print(
+            "Below the limit, but checked by no other point, and so perhaps by chance "
+            f"among so many wrong ones: {listed}",
+            markup=False,
+        )
 
 
 def _show_doubts(console: Console, verdicts: Verdicts, many: bool) -> None:

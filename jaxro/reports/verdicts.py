@@ -11,7 +11,8 @@ decisions.csv, decisions.json.
   points in the order of rejection (those of one list went together), the undecided
   points and the elements by round.
 
-What a statistic is, and its unit, says the procedure; inf: wrong by any measure.
+What a statistic is, and its unit, says the procedure; inf: wrong by any measure. A
+rejected point with a statistic below its limit fits, but no other point checks it.
 """
 
 from collections.abc import Sequence
@@ -147,6 +148,12 @@ class Verdicts:
         out = np.flatnonzero(~self.of_points["kept"])
         order = self.of_points["order"][out]
         return out[np.lexsort((order, self.table.owners[out]))]
+
+    @cached_property
+    def fits(self) -> Bool[np.ndarray, " row"]:
+        """The rows whose statistic is below the limit of a test."""
+        statistic, limit = self.of_points["statistic"], self.of_points["limit"]
+        return (statistic < limit) & np.isfinite(limit)
 
     @cached_property
     def undecided(self) -> dict[int, list[str]]:
