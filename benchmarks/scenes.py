@@ -697,8 +697,8 @@ FORWARD_BASE = (0.5, 0.0, -1.0)
 
 FACADE_DISTANCE, FACADE_RELIEF = 20.0, 0.05
 
-
 FORWARD_POINTS = 600
+"""Points of a pair."""
 
 
 def forward_facades(pairs: int, wrong: float, *, seed: int = 0) -> Scenes:
