@@ -76,13 +76,24 @@ def _everything(result: Any) -> Any:
 
 
 class Selected(NamedTuple):
-    """What is kept of (pair, orientation) where the pair does not matter."""
+    """What is kept of a pair and its result where the pair does not matter."""
 
-    select: Callable[[Orientation], PyTree]
+    select: Callable[[Any], PyTree]
 
-    def __call__(self, pair: Pair, orientation: Orientation) -> PyTree:
+    def __call__(self, _: Pair, result: Any) -> PyTree:
         """What is kept."""
-        return self.select(orientation)
+        return self.select(result)
+
+
+def _reading(select: Callable[[Any], PyTree], read: Callable | None) -> Callable:
+    """What makes of a pair and its result what is wanted. Raises ValueError for two."""
+    if read is None:
+        return Selected(select)
+    if select is not _everything:
+        raise ValueError(
+            "select and read exclude each other; read sees the result, too"
+        )
+    return read
 
 
 def orient_batch(
@@ -107,14 +118,10 @@ def orient_batch(
     `orient`. The results are those of `orient` one by one, to rounding. Up to 512 MB of
     results that nobody holds any more are kept as memory for the next ones.
     """
-    if read is not None and select is not _everything:
-        raise ValueError(
-            "select and read exclude each other; read sees the orientation, too"
-        )
+    read = _reading(select, read)
     host, report = jax.tree.map(np.asarray, double(pairs)), progress or silent
     split = Split(threads, chunk)
     problem = problem_of_all(options | {"start": start})
-    read = Selected(select) if read is None else read
     if not isinstance(start, Auto):
         return _finish(orient_slabs(host, problem, read, split, report))
     out, fits = orient_slabs_near(host, problem, read, split, report)
@@ -197,6 +204,7 @@ def clean_batch(
     procedure: AbstractProcedure,
     *,
     select: Callable[[Rejection], PyTree] = _everything,
+    read: Callable[[Pair, Rejection], PyTree] | None = None,
     progress: Progress | None = None,
     threads: int | None = None,
     chunk: int | None = None,
@@ -210,21 +218,21 @@ def clean_batch(
     host, report = jax.tree.map(np.asarray, double(pairs)), progress or silent
     procedure, host = take_sigma(procedure, host)
     split = Split(threads, chunk)
-    out = clean_in_stages(host, procedure, select, split, report)
-    return _finish(out)
+    read = _reading(select, read)
+    return _finish(clean_in_stages(host, procedure, read, split, report))
 
 
 def clean_in_stages(
     pairs: Pair,
     procedure: AbstractProcedure,
-    select: Callable[[Rejection], PyTree],
+    read: Callable[[Pair, Rejection], PyTree],
     split: Split,
     report: Progress,
 ) -> PyTree:
-    """What is selected of every pair's rejection, in NumPy: the stages in turn, each
+    """What is read of every pair's rejection, in NumPy: the stages in turn, each
     for the pairs that are still open, and one conclusion for all."""
     if not isinstance(procedure, InStages):
-        return clean_slabs(pairs, procedure, select, split, report)
+        return clean_slabs(pairs, procedure, read, split, report)
     first, *others = procedure.separate()
     settings = _settings(pairs)  # whatever number of pairs is left open
     decision = decide_slabs(pairs, first, split, report, settings)
@@ -235,7 +243,7 @@ def clean_in_stages(
             own = _few_shapes(stage, left_over, split)
             new = decide_slabs(left_over, stage, own, silent, settings)
             decision = _replace_rows(decision, rest, new)
-    return conclude_slabs(pairs, decision, procedure, select, split)
+    return conclude_slabs(pairs, decision, procedure, read, split)
 
 
 def _few_shapes(stage: AbstractDecider, pairs: Pair, split: Split) -> Split:
@@ -253,14 +261,14 @@ def _few_shapes(stage: AbstractDecider, pairs: Pair, split: Split) -> Split:
 def clean_slabs(
     pairs: Pair,
     procedure: AbstractProcedure,
-    select: Callable[[Rejection], PyTree],
+    read: Callable[[Pair, Rejection], PyTree],
     split: Split,
     report: Progress,
 ) -> PyTree:
-    """What is selected of every pair's rejection, in NumPy, by one program."""
+    """What is read of every pair's rejection, in NumPy, by one program."""
     split, chunk = _split_of(procedure, pairs, split)
     program = _clean_slab.using(_settings(pairs))
-    program = program.bind(procedure=procedure, select=select, chunk=chunk)
+    program = program.bind(procedure=procedure, read=read, chunk=chunk)
     return spread(pairs, program, split, chunk, report)
 
 
@@ -282,13 +290,13 @@ def conclude_slabs(
     pairs: Pair,
     decision: Decision,
     procedure: InStages,
-    select: Callable[[Rejection], PyTree],
+    read: Callable[[Pair, Rejection], PyTree],
     split: Split,
 ) -> PyTree:
-    """What is selected of the rejections that follow from decisions, in NumPy."""
+    """What is read of the rejections that follow from decisions, in NumPy."""
     chunk = _chunk(pairs, split.chunk)
     program = _conclude_slab.using(_settings(pairs))
-    program = program.bind(procedure=procedure, select=select, chunk=chunk)
+    program = program.bind(procedure=procedure, read=read, chunk=chunk)
     return spread((pairs, decision), program, split, chunk)
 
 
@@ -381,9 +389,9 @@ def _orient_slab_near(
 
 @compiled(unit="points")
 def _clean_slab(
-    pairs: Pair, *, procedure: AbstractProcedure, select: Callable, chunk: int
+    pairs: Pair, *, procedure: AbstractProcedure, read: Callable, chunk: int
 ) -> PyTree:
-    return map_chunks(lambda pair: select(procedure.clean(pair)), pairs, chunk)
+    return map_chunks(lambda pair: read(pair, procedure.clean(pair)), pairs, chunk)
 
 
 @compiled(unit="points")
@@ -393,9 +401,9 @@ def _decide_slab(pairs: Pair, *, stage: AbstractDecider, chunk: int) -> Decision
 
 @compiled(unit="points")
 def _conclude_slab(
-    data: tuple[Pair, Decision], *, procedure: InStages, select: Callable, chunk: int
+    data: tuple[Pair, Decision], *, procedure: InStages, read: Callable, chunk: int
 ) -> PyTree:
-    return map_chunks(lambda one: select(procedure.conclude(*one)), data, chunk)
+    return map_chunks(lambda one: read(one[0], procedure.conclude(*one)), data, chunk)
 
 
 def _finish(out: PyTree) -> PyTree:

@@ -257,7 +257,7 @@ class Decisions(NamedTuple):
     undecided: Bool[np.ndarray, " row"]
 
 
-def decisions(rejection: Rejection) -> tuple[PyTree, PyTree]:
+def decisions(_: Pair, rejection: Rejection) -> tuple[PyTree, PyTree]:
     """The outcome of a pair; of every point (kept, order, statistic, undecided)."""
     return rejection.outcome._value, (
         rejection.mask,
@@ -271,7 +271,7 @@ def clean_ragged(
     pairs: Ragged,
     procedure: AbstractProcedure,
     *,
-    select: Callable[[Rejection], tuple[PyTree, PyTree]] = decisions,
+    read: Callable[[Pair, Rejection], tuple[PyTree, PyTree]] = decisions,
     plan: Plan | None = None,
     progress: Progress | None = None,
     threads: int | None = None,
@@ -279,7 +279,7 @@ def clean_ragged(
     """`procedure` of pairs of any lengths, on all cores: its `Decisions`, flat, in the
     rows of `pairs`.
 
-    `select(rejection)`: what is wanted instead, of the pair and of every point; the
+    `read(pair, rejection)`: what is wanted instead, of the pair and of every point; the
     result then is these two.
     """
     pairs = check(pairs)
@@ -289,15 +289,15 @@ def clean_ragged(
     if not isinstance(procedure, InStages):
         for members, size, slabs in batches:
             batch = pairs.pad_to(members, size)
-            found = clean_slabs(batch, procedure, select, slabs, out.told)
+            found = clean_slabs(batch, procedure, read, slabs, out.told)
             out.store(members, size, found)
     else:
         decided = _decide(pairs, procedure, plan, threads, out.told)
         for members, size, slabs in batches:
             batch, own = pairs.pad_to(members, size), decided(members, size)
-            found = conclude_slabs(batch, own, procedure, select, slabs)
+            found = conclude_slabs(batch, own, procedure, read, slabs)
             out.store(members, size, found)
-    if select is not decisions:
+    if read is not decisions:
         return out.tree
     outcome, (kept, order, statistic, undecided) = out.tree
     return Decisions(

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -66,7 +66,7 @@ def orient_block(
     """
     block = from_pairs(left, right, pairs, points) if more is None else more
     number = {name: k for k, name in enumerate(block.photos)}
-    oriented = Oriented(*clean_ragged(pairs, Recommended(), select=_read)[0])
+    oriented = Oriented(*clean_ragged(pairs, Recommended(), read=_read)[0])
     models = models_of(
         np.array([number[name] for name in left]),
         np.array([number[name] for name in right]),
@@ -127,7 +127,7 @@ def leave_out(ground: Ground, rows: Bool[np.ndarray, " known"]) -> Ground:
     return ground._replace(coordinates=at)
 
 
-def _read(rejection: Rejection) -> tuple[tuple, tuple]:
+def _read(_: Any, rejection: Rejection) -> tuple[tuple, tuple]:
     """The `Oriented` of a pair, and nothing of its points."""
     found = rejection.orientation
     return (found.pose, found.cofactor, found.usable), ()

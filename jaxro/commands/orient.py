@@ -154,7 +154,7 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
     found = solve(job.pairs, job.task, plan, told=told)
     used, verdicts = job.pairs, None
     if found.decided is not None:
-        used = used._replace(mask=used.mask & found.decided["kept"])
+        used = used._replace(mask=used.mask & found.decided["in_use"])
         verdicts = make_verdicts(job.table, found)
     rigorous = job.options.residual == "rigorous"
     results = make_results(

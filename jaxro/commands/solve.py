@@ -2,6 +2,7 @@
 pairs and many. A table of a single pair goes through programs of one pair, which compile
 sooner."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,10 +18,11 @@ from ..batches.padding import Plan
 from ..batches.ragged import Ragged, clean_ragged, orient_ragged
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements, DependentElements
-from ..geometry.pairs import Pair
+from ..geometry.pairs import Pair, mask_unusable
+from ..orientation.express import express
 from ..orientation.orient import Orientation, orient
 from ..orientation.results import RESULTS
-from ..rejection import AbstractProcedure
+from ..rejection import AbstractProcedure, Rejection
 from ..reports.columns import USABLE, Units, columns_of, is_usable
 from ..reports.model import Results
 from ..reports.reader import Assessor, Oriented, Reader
@@ -76,9 +78,36 @@ class Task:
         return Reader(self.system, wanted, self.procedure is not None)
 
     @property
+    def cleaned_reader(self) -> "CleanedReader":
+        """Reads what is wanted of a cleaned pair."""
+        return CleanedReader(self.reader, self.system, self.base, self.rounds)
+
+    @property
     def assessor(self) -> Assessor:
         """Reads what is wanted of the reliability."""
         return Assessor(self.system, self.sigma_known)
+
+
+class CleanedReader(NamedTuple):
+    """read(pair, rejection) -> the outcome, and what `reader` tells of the pair in the
+    elements `system` with this `base`; the decision about its points, and what is told
+    of them; with the rounds if they are wanted."""
+
+    reader: Reader
+    system: type[AbstractElements]
+    base: float | None
+    rounds: bool
+
+    def __call__(self, pair: Pair, rejection: Rejection) -> tuple[Any, Any]:
+        """The columns of the pair and of its points."""
+        of_pair, of_points = (with_log if self.rounds else without_log)(rejection)
+        _, bad_input = mask_unusable(pair)
+        pair = pair.with_mask(rejection.in_use)
+        orientation = express(pair, rejection.orientation, self.system, self.base)
+        told = RESULTS.where(bad_input, RESULTS.non_finite_input, orientation.result)
+        orientation = dataclasses.replace(orientation, result=told)
+        columns, tables = self.reader(pair, orientation)
+        return of_pair | {"pair": columns}, of_points | {"points": tables}
 
 
 class Found(NamedTuple):
@@ -102,14 +131,21 @@ def solve(
     """What is found of the pairs, in NumPy. `plan` is None where the table has one pair
     only."""
     if task.procedure is None:
-        return Found(*_orient(pairs, task, plan, threads, told))
-    outcome, decided, rounds = _clean(pairs, task, plan, threads, told)
+        told_of = _orient(pairs, task, plan, threads, told)
+        return Found(*_complete(pairs, *told_of, task, plan, threads))
+    cleaned = _clean(pairs, task, plan, threads, told)
+    of_pairs, of_points, outcome, decided, rounds = cleaned
     # of unusable points the orientation tells
-    use = decided["kept"] | unusable(decided["kept"], decided["order"])
+    use = decided["in_use"] | unusable(decided["kept"], decided["order"])
     every = pairs
     pairs = pairs._replace(mask=pairs.mask & use)
-    found = _orient(pairs, task, plan, threads, lambda done: None)
-    return _of_copies(Found(*found, outcome, decided, rounds), every)
+    if task.residual != "rigorous":
+        result = of_pairs["result"]
+        of_pairs, of_points = _orient(pairs, task, plan, threads, lambda done: None)
+        refused = is_usable(of_pairs["result"]) & ~is_usable(result)
+        of_pairs["result"] = np.where(refused, result, of_pairs["result"])
+    told_of = _complete(pairs, of_pairs, of_points, task, plan, threads)
+    return _of_copies(Found(*told_of, outcome, decided, rounds), every)
 
 
 def _of_copies(found: Found, pairs: Ragged) -> Found:
@@ -143,6 +179,18 @@ def _orient(
             progress=lambda done, total: told(done),
             **task.keywords,
         )
+    return of_pairs, of_points
+
+
+def _complete(
+    pairs: Ragged,
+    of_pairs: dict[str, Any],
+    of_points: dict[str, dict[str, Any]],
+    task: Task,
+    plan: Plan | None,
+    threads: int | None,
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """The columns with those of reliability, and without those of no use."""
     if "reliability" in task.tables:
         assessed = _assess(pairs, of_pairs, of_points, task, plan, threads)
         of_points = of_points | {"reliability": assessed}
@@ -226,17 +274,27 @@ def _assess_one(oriented: Oriented, *, assessor: Assessor) -> Any:
     return assessor(oriented)
 
 
+class Cleaned(NamedTuple):
+    """The columns of the pairs and of their points; the outcomes, the decision about
+    every point, and the rounds if they are wanted."""
+
+    of_pairs: dict[str, Any]
+    of_points: dict[str, dict[str, Any]]
+    outcome: Int[np.ndarray, " pair"]
+    decided: dict[str, Any]
+    rounds: Rounds | None = None
+
+
 def _clean(
     pairs: Ragged, task: Task, plan: Plan | None, threads: int | None, told: Told
-) -> tuple[Any, dict[str, Any], Rounds | None]:
-    """The outcomes, the decision about every point, and the rounds if they are
-    wanted."""
+) -> Cleaned:
+    """The decisions of the procedure, and its orientations."""
     assert task.procedure is not None
+    read = task.cleaned_reader
     if plan is None:
         size = int(pairs.lengths[0])
-        select = with_log if task.rounds else without_log
         batch = pairs.pad_to(np.zeros(1, int), size)
-        found = clean_batch(batch, task.procedure, select=select, threads=threads)
+        found = clean_batch(batch, task.procedure, read=read, threads=threads)
         of_pair, of_points = jax.tree.map(np.asarray, found)
         of_points = jax.tree.map(lambda a: a[0], of_points)
         told(1)
@@ -244,7 +302,7 @@ def _clean(
         of_pair, of_points = clean_ragged(
             pairs,
             task.procedure,
-            select=without_log,
+            read=read,
             plan=plan,
             threads=threads,
             progress=lambda done, total: told(done),
@@ -255,17 +313,17 @@ def _clean(
     if task.rounds:
         of_round = jax.tree.map(lambda a: a[0], of_pair["rounds"])
         rounds = read_rounds(of_round, of_points.pop("rounds"))
-    return of_pair["outcome"], of_points, rounds
+    told_of = of_pair["pair"], of_points.pop("points")
+    return Cleaned(*told_of, of_pair["outcome"], of_points, rounds)
 
 
 def _clean_with_rounds(
     pairs: Ragged, task: Task, plan: Plan, threads: int | None, told: Told
-) -> tuple[Any, dict[str, Any], Rounds]:
+) -> Cleaned:
     """The same with the rounds, which take much memory: not all pairs together."""
     assert task.procedure is not None
     each: dict[int, Rounds] = {}
-    outcome = np.zeros(len(pairs.lengths), int)
-    decided: dict[str, Any] = {}
+    whole: tuple[Any, Any] | None = None
     most = lambda size: max(1, LOG_NUMBERS // size**2)
     slabs = dict(zip(plan.sizes, plan.slabs, strict=True))
     for members, size in by_size(pairs, plan, most):
@@ -274,20 +332,34 @@ def _clean_with_rounds(
         of_pairs, of_points = clean_ragged(
             part,
             task.procedure,
-            select=with_log,
+            read=task.cleaned_reader,
             plan=Plan((size,), (slabs[size],), (size,)),
             threads=threads,
             progress=lambda done, total, before=finished: told(before + done),
         )
         log = of_points.pop("rounds")
-        found = _part_rounds(of_pairs["rounds"], log, part.begins)
+        found = _part_rounds(of_pairs.pop("rounds"), log, part.begins)
         each.update(zip(members.tolist(), found, strict=True))
-        outcome[members] = of_pairs["outcome"]
-        for name, values in of_points.items():
-            everywhere = np.zeros(pairs.x_left.shape, values.dtype)
-            decided.setdefault(name, everywhere)[np.concatenate(rows)] = values
+        if whole is None:
+            room = lambda count: lambda a: np.zeros((count, *a.shape[1:]), a.dtype)
+            whole = (
+                jax.tree.map(room(len(pairs.lengths)), of_pairs),
+                jax.tree.map(room(len(pairs.x_left)), of_points),
+            )
+        for everywhere, values, places in zip(
+            whole, (of_pairs, of_points), (members, np.concatenate(rows)), strict=True
+        ):
+            jax.tree.map(lambda a, b, at=places: _put(a, at, b), everywhere, values)
+    assert whole is not None
+    of_pairs, of_points = whole
     rounds = join_rounds([each[k] for k in range(len(each))], pairs.begins[:-1])
-    return outcome, decided, rounds
+    told_of = of_pairs["pair"], of_points.pop("points")
+    return Cleaned(*told_of, of_pairs["outcome"], of_points, rounds)
+
+
+def _put(everywhere: np.ndarray, places: np.ndarray, values: np.ndarray) -> None:
+    """Write the values to their places."""
+    everywhere[places] = values
 
 
 def _part_rounds(
@@ -315,7 +387,7 @@ def make_results(
     """What is found of the pairs of a table, with its points that were kept."""
     of_pairs, of_points = found.of_pairs, found.of_points
     if found.decided is not None:
-        rows = np.flatnonzero(found.decided["kept"])
+        rows = np.flatnonzero(found.decided["in_use"])
         table = table.choose(rows)
         of_points = jax.tree.map(lambda column: column[rows], of_points)
         of_pairs = of_pairs | {"outcome": found.outcome}

@@ -7,7 +7,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment import results
-from ..geometry.elements import AbstractElements
+from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.pairs import Pair, mask_unusable
 from ..xla.passes import total
 from . import chosen_elements, degeneracy, planes
@@ -58,7 +58,15 @@ def verdict(
         ),
         (
             RESULTS.elements_undefined,
-            solved & _lack_elements(problem, description, weakest),
+            solved
+            & lack_elements(
+                pose,
+                description.elements,
+                description.cofactor,
+                description.length,
+                noise.size,
+                weakest,
+            ),
         ),
         (
             RESULTS.photos_swapped,
@@ -81,19 +89,36 @@ def largest_variance(
     return jnp.max(jnp.diagonal(degeneracy.in_radians(elements, cofactor)[0]))
 
 
-def _lack_elements(
-    problem: Problem, description: Description, weakest: Float[Array, ""]
+def lack_elements(
+    pose: RelativePose,
+    elements: AbstractElements,
+    cofactor: Float[Array, "5 5"],
+    length: Float[Array, ""],
+    noise: Float[Array, ""],
+    weakest: Float[Array, ""],
 ) -> Bool[Array, ""]:
     """Whether the elements that were asked for do not exist at the pose, or are far
-    less certain than it."""
-    pose = description.pose
-    base = pose.bx, pose.by, pose.bz
-    variance = largest_variance(description.elements, description.cofactor)
-    missing = ~problem.elements.exist(base, description.length)
-    uncertain = description.noise.size**2 * variance > WEAK**2
+    less certain than it. `noise`: the size of the measuring errors; `weakest`: the
+    `largest_variance` of the pose itself."""
+    missing = ~type(elements).exist((pose.bx, pose.by, pose.bz), length)
+    variance = largest_variance(elements, cofactor)
+    uncertain = noise**2 * variance > WEAK**2
     # without redundancy there is no noise to judge by
     rounding = degeneracy.ROUNDING**2 * variance > weakest
     return missing | uncertain | rounding
+
+
+def noise_of(
+    pair: Pair, orientation: Orientation
+) -> tuple[degeneracy.Noise, Float[Array, ""]]:
+    """The measuring errors that an orientation is judged by, without a derivative, and
+    the root mean square of the sigmas of the pair."""
+    n = jnp.maximum(pair.count, 1.0)
+    mean_square = total(jnp.where(pair.mask, pair.sigma**2, 0.0)) / n
+    sigma = jnp.where(mean_square > 0, jnp.sqrt(mean_square), 1.0)
+    freedom = orientation.degrees_of_freedom.astype(sigma.dtype)
+    sigma0 = lax.stop_gradient(jnp.where(freedom > 0, orientation.sigma0, 0.0))
+    return degeneracy.noise(sigma0, freedom, sigma, pair.focal_left), sigma
 
 
 def check_plane(
@@ -105,12 +130,9 @@ def check_plane(
     # a verdict has no derivative
     pair, pose = lax.stop_gradient((mask_unusable(pair)[0], orientation.pose))
     squares = planes.second_squares(pair, pose, asked)
-    n = jnp.maximum(pair.count, 1.0)
-    mean_square = total(jnp.where(pair.mask, pair.sigma**2, 0.0)) / n
-    sigma = jnp.where(mean_square > 0, jnp.sqrt(mean_square), 1.0)
-    freedom = orientation.degrees_of_freedom.astype(sigma.dtype)
+    noise, sigma = noise_of(pair, orientation)
+    freedom = noise.freedom
     sigma0 = lax.stop_gradient(jnp.where(freedom > 0, orientation.sigma0, 0.0))
-    noise = degeneracy.noise(sigma0, freedom, sigma, pair.focal_left)
     rounding = planes.ROUNDING * pair.count * (pair.focal_left / sigma) ** 2
     fits = squares <= noise.tolerance(freedom * sigma0**2) + rounding
     result = RESULTS.where(asked & fits, RESULTS.two_solutions, orientation.result)

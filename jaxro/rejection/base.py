@@ -81,9 +81,9 @@ class Rejection(eqx.Module):
 
     `mask`: the points kept. `order`: 1 for the points rejected first, 2 for the next,
     and so on; 0 for points kept. `statistic`: the test statistic of every point in the
-    round that rejected it, or in the last round. `orientation`: from the points kept.
-    `undecided`: points of which one is wrong, but the measurements do not tell which;
-    they are kept.
+    round that rejected it, or in the last round. `undecided`: points of which one is
+    wrong, but the measurements do not tell which; they are kept. `orientation`: from
+    the points `in_use`, those kept but for the undecided one that is most likely wrong.
     """
 
     mask: Bool[Array, "*pairs point"]
@@ -93,13 +93,14 @@ class Rejection(eqx.Module):
     orientation: Orientation
     outcome: OUTCOMES
     undecided: Bool[Array, "*pairs point"]
+    in_use: Bool[Array, "*pairs point"]
 
     def first(self, points: int) -> "Rejection":
         """The same without the places behind so many points."""
         if points == self.mask.shape[-1]:
             return self
         of_points = lambda r: [
-            *(r.mask, r.order, r.statistic, r.undecided),
+            *(r.mask, r.order, r.statistic, r.undecided, r.in_use),
             *(r.log.statistic, r.log.rejected, r.log.parallax),
         ]
         short = eqx.tree_at(of_points, self, first_points(of_points(self), points))

@@ -160,6 +160,7 @@ def conclude(
         orientation=orientation,
         outcome=OUTCOMES.where(useless, OUTCOMES.not_oriented, outcome),
         undecided=doubtful,
+        in_use=history.mask,
     )
 
 

@@ -34,4 +34,5 @@ class TwoStage(AbstractProcedure):
             orientation=two.orientation,
             outcome=OUTCOMES.where(unfinished, one.outcome, two.outcome),
             undecided=two.undecided,
+            in_use=two.in_use,
         )

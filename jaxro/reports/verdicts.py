@@ -42,6 +42,7 @@ class Decision(NamedTuple):
     statistic: Float[Either, "point"]
     limit: Float[Either, "point"]
     undecided: Bool[Either, "point"]
+    in_use: Bool[Either, "point"]
     outcome: Int[Either, ""]
 
 
@@ -61,6 +62,7 @@ def decision(found: Rejection) -> Decision:
         statistic=statistic,
         limit=limit,
         undecided=found.undecided,
+        in_use=found.in_use,
         outcome=found.outcome._value,
     )
 
