@@ -157,6 +157,19 @@ class RelativePose(AbstractElements):
             ),
         )
 
+    def step_to(self, near: "RelativePose") -> Step:
+        """The step that moves this pose to one that is near, to first order."""
+        w, turn = self.qw, (self.qx, self.qy, self.qz)
+        other = near.qx, near.qy, near.qz
+        crossed = rot.cross(turn, other)
+        rotation = (
+            2 * (w * n - near.qw * o - c)
+            for o, n, c in zip(turn, other, crossed, strict=True)
+        )
+        tangents = rot.tangents((self.bx, self.by, self.bz))
+        base = near.bx, near.by, near.bz
+        return *rotation, *(rot.dot(tangent, base) for tangent in tangents)
+
     def slopes(
         self, function: Callable, x: Step = (), *, bilinear: bool = False
     ) -> tuple[Any, list[Any]]:

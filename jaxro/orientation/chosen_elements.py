@@ -66,15 +66,23 @@ def in_system(
         return convert(pose, system, length)
 
     origin = (jnp.zeros_like(length),) * 5
+    found = at(origin)
     # `tangents` of -b are those of b, the second one turned: b1 changes its sign
-    if system is RelativePose:
+    if isinstance(found, RelativePose) and isinstance(solved, RelativePose):
         one = jnp.ones_like(sign)
         signs = jnp.stack([one, one, one, sign, one])
-        return at(origin), cofactor * signs[:, None] * signs[None, :]
-    push = jax.linearize(lambda *x: jnp.stack(at(x).values()), *origin)[1]
+        return found, cofactor * signs[:, None] * signs[None, :]
+
+    def values(*x: Array) -> Array:
+        moved = at(x)
+        if isinstance(found, RelativePose) and isinstance(moved, RelativePose):
+            return jnp.stack(found.step_to(moved))  # its parameters are local
+        return jnp.stack(moved.values())
+
+    push = jax.linearize(values, *origin)[1]
     jacobian = jax.vmap(push, out_axes=1)(*jnp.eye(5, dtype=cofactor.dtype))
     right = jnp.sum(jacobian[:, :, None] * cofactor[None, :, :], axis=1)
-    return at(origin), jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
+    return found, jnp.sum(right[:, None, :] * jacobian[None, :, :], axis=2)
 
 
 def wrong_side(

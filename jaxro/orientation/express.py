@@ -22,23 +22,23 @@ def express(
     system: type[AbstractElements],
     base: ArrayLike | None = None,
 ) -> Orientation:
-    """The orientation of a pair, which is in `RelativePose`, in the elements that
-    `orient(pair, elements=system, base=base)` gives: with their cofactors, the model in
-    their frame and scale, and the result where there are no such elements."""
-    if system is RelativePose:
+    """The orientation of a pair in the elements that `orient(pair, elements=system,
+    base=base)` gives: with their cofactors, the model in their frame and scale, and the
+    result where there are no such elements."""
+    if system is RelativePose and isinstance(orientation.elements, RelativePose):
         return orientation
     pair, pose = mask_unusable(pair)[0], orientation.pose
     length = chosen_elements.length(pair, system, base, pose)
     flipped = jnp.zeros_like(pose.bx, bool)
     elements, cofactor = chosen_elements.in_system(
-        pose, orientation.cofactor, flipped, system, length
+        orientation.elements, orientation.cofactor, flipped, system, length
     )
     noise, _ = noise_of(pair, orientation)
     scale = system.scale((pose.bx, pose.by, pose.bz), length)
     meet = model_point(pair, pose, elements, scale, noise.size)
     points = pair.coordinates, pair.sigma, pair.mask, pair.roots
     model, *_ = pointwise(meet, *points)
-    weakest = largest_variance(pose, orientation.cofactor)
+    weakest = largest_variance(orientation.elements, orientation.cofactor)
     lack = lack_elements(pose, elements, cofactor, length, noise.size, weakest)
     swapped = chosen_elements.wrong_side(system, base, pose)
     result = orientation.result

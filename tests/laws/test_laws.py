@@ -537,6 +537,17 @@ def test_a_known_start_does_not_change_what_is_given():
         np.testing.assert_allclose(found.model[2], scale * free.model[2], rtol=1e-8)
 
 
+@pytest.mark.parametrize("system", [IndependentElements, DependentElements])
+def test_a_pose_has_its_cofactors_whatever_elements_were_iterated(system):
+    """They are those of its own local parameters, not of the start's."""
+    measured = problems.tilted()
+    plain = problems.orient(measured)
+    start = jaxro.convert(plain.pose, system, jnp.asarray(60.0))
+    found = problems.orient(measured, start=start)
+    np.testing.assert_allclose(found.pose.base, plain.pose.base, atol=1e-9)
+    np.testing.assert_allclose(found.cofactor, plain.cofactor, rtol=1e-6, atol=1e-14)
+
+
 def test_vertical_start_is_enough_for_vertical_photos():
     """Independent elements start from zero and end where the general start ends."""
     measured = problems.tilted()
