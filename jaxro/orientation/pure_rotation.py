@@ -17,7 +17,8 @@ from ..adjustment.guarded import root, times
 from ..adjustment.terms import Term
 from ..geometry import rotations as rot
 from ..geometry.elements import RelativePose
-from ..geometry.pairs import Pair, double, mask_unusable, pad, room_for
+from ..geometry.pairs import Pair, double, mask_unusable, pad, quickly, room_for
+from ..xla.programs import compiled
 from .starts.general import rotation_only, vectors
 
 ANGLES = ("omega", "phi", "kappa")
@@ -55,7 +56,13 @@ def orient_rotation(pair: Pair) -> PureRotation:
     `zero_base` of `orient` and of procedures that reject points.
     """
     pair = double(pair)
-    pair, _ = mask_unusable(pad(pair, room_for(pair.x_left.size)))
+    return _orient(pad(pair, room_for(pair.x_left.size)))
+
+
+@compiled(settings=quickly, unit="points")
+def _orient(pair: Pair) -> PureRotation:
+    """The rotation of one pair, as a program."""
+    pair, _ = mask_unusable(pair)
     start, _ = rotation_only(*vectors(pair), pair.mask)
     matrix = rot.as_array(start.relative()[0])
     focals = pair.focal_left, pair.focal_right
