@@ -26,11 +26,12 @@ from ..orientation.result import Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..orientation.verdict import check_plane
 from ..rejection import AbstractProcedure, Rejection
-from ..rejection.base import AbstractDecider, Decision, InStages, take_sigma
+from ..rejection.base import InSteps, take_sigma
 from ..rejection.hypotheses import AbstractHypotheses
+from ..rejection.judgement import AbstractStep, Judgement, nothing_known
 from ..rejection.search import Search
 from ..xla.kernels import one_kernel, one_kernel_fusing_points
-from ..xla.programs import compiled
+from ..xla.programs import Compiled, compiled
 from ..xla.settings import (
     FEW,
     MOMENT,
@@ -231,25 +232,27 @@ def clean_in_stages(
 ) -> PyTree:
     """What is read of every pair's rejection, in NumPy: the stages in turn, each
     for the pairs that are still open, and one conclusion for all."""
-    if not isinstance(procedure, InStages):
+    if not isinstance(procedure, InSteps):
         return clean_slabs(pairs, procedure, read, split, report)
-    first, *others = procedure.separate()
-    settings = _settings(pairs)  # whatever number of pairs is left open
-    decision = decide_slabs(pairs, first, split, report, settings)
-    for stage in others:
-        rest = np.flatnonzero(~decision.believed)
-        if rest.size:
-            left_over = jax.tree.map(lambda a, rest=rest: a[rest], pairs)
-            own = _few_shapes(stage, left_over, split)
-            new = decide_slabs(left_over, stage, own, silent, settings)
-            decision = _replace_rows(decision, rest, new)
-    return conclude_slabs(pairs, decision, procedure, read, split)
+    settings = _settings(pairs)  # whatever number of pairs is open
+    known = nothing_known(pairs.focal_left, pairs.mask)
+    for step in procedure.steps():
+        open_ = np.flatnonzero(step.is_open(known))
+        if open_.size == len(pairs.focal_left):
+            known = judge_slabs(pairs, known, step, split, report, settings)
+        elif open_.size:
+            some = _rows((pairs, known), open_)
+            own = _few_shapes(step, some[0], split)
+            new = judge_slabs(*some, step, own, silent, settings)
+            known = _replace_rows(known, open_, new)
+        report = silent
+    return conclude_slabs(pairs, known, procedure, read, split)
 
 
-def _few_shapes(stage: AbstractDecider, pairs: Pair, split: Split) -> Split:
-    """How what is left over is split: whatever number of pairs that is, calls have one
-    of few shapes, 4, 16, 64, ... pairs."""
-    split, _ = _split_of(stage, pairs, split)
+def _few_shapes(step: AbstractStep, pairs: Pair, split: Split) -> Split:
+    """How the pairs that are open to a step are split: whatever number of pairs that
+    is, calls have one of few shapes, 4, 16, 64, ... pairs."""
+    split, _ = _split_of(step, pairs, split)
     if split.slab is not None or not has_caches():
         return split
     total, points = pairs.x_left.shape
@@ -272,32 +275,56 @@ def clean_slabs(
     return spread(pairs, program, split, chunk, report)
 
 
-def decide_slabs(
+def judge_slabs(
     pairs: Pair,
-    stage: AbstractDecider,
+    known: Judgement,
+    step: AbstractStep,
     split: Split,
     report: Progress,
     settings: dict[str, Any] | None = None,
-) -> Decision:
-    """The decisions of a stage, in NumPy."""
-    split, chunk = _split_of(stage, pairs, split)
-    program = _decide_slab.using(settings or _settings(pairs))
-    program = program.bind(stage=stage, chunk=chunk)
-    return spread(pairs, program, split, chunk, report)
+) -> Judgement:
+    """What is known of pairs after a step, in NumPy."""
+    split, chunk = _split_of(step, pairs, split)
+    program = _judge_slab.using(settings or _settings(pairs))
+    program = program.bind(step=step, chunk=chunk)
+    return spread((pairs, known), program, split, chunk, report)
 
 
 def conclude_slabs(
     pairs: Pair,
-    decision: Decision,
-    procedure: InStages,
+    known: Judgement,
+    procedure: InSteps,
     read: Callable[[Pair, Rejection], PyTree],
     split: Split,
 ) -> PyTree:
-    """What is read of the rejections that follow from decisions, in NumPy."""
-    chunk = _chunk(pairs, split.chunk)
-    program = _conclude_slab.using(_settings(pairs))
-    program = program.bind(procedure=procedure, read=read, chunk=chunk)
-    return spread((pairs, decision), program, split, chunk)
+    """What is read of the rejections that follow from what is known, in NumPy."""
+    chunk, settings = _chunk(pairs, split.chunk), _settings(pairs)
+
+    def run(slab: Compiled, rows: np.ndarray) -> PyTree:
+        """What the program tells of these pairs."""
+        program = slab.using(settings)
+        program = program.bind(procedure=procedure, read=read, chunk=chunk)
+        every = rows.size == len(pairs.focal_left)
+        some = (pairs, known) if every else _rows((pairs, known), rows)
+        return spread(some, program, split, chunk)
+
+    usual = procedure.is_usual(known)
+    first, rest = np.flatnonzero(usual), np.flatnonzero(~usual)
+    if not first.size:
+        return run(_conclude_slab, rest)
+    out, holds = run(_conclude_usual_slab, first)
+    if rest.size:
+        room = lambda a: np.empty((usual.size, *a.shape[1:]), a.dtype)
+        out = _replace_rows(jax.tree.map(room, out), first, out)
+    rest = np.sort(np.concatenate([rest, first[~holds]]))
+    if rest.size:
+        out = _replace_rows(out, rest, run(_conclude_slab, rest))
+    return out
+
+
+def _rows(tree: PyTree, rows: np.ndarray) -> PyTree:
+    """These rows of arrays."""
+    return jax.tree.map(lambda a: a[rows], tree)
 
 
 def map_batch(
@@ -395,13 +422,26 @@ def _clean_slab(
 
 
 @compiled(unit="points")
-def _decide_slab(pairs: Pair, *, stage: AbstractDecider, chunk: int) -> Decision:
-    return map_chunks(stage.decide, pairs, chunk)
+def _judge_slab(
+    data: tuple[Pair, Judgement], *, step: AbstractStep, chunk: int
+) -> Judgement:
+    return map_chunks(lambda one: step.judge(*one), data, chunk)
+
+
+@compiled(unit="points")
+def _conclude_usual_slab(
+    data: tuple[Pair, Judgement], *, procedure: InSteps, read: Callable, chunk: int
+) -> tuple[PyTree, Array]:
+    def one(data: tuple[Pair, Judgement]) -> tuple[PyTree, Array]:
+        rejection, holds = procedure.conclude_usual(*data)
+        return read(data[0], rejection), holds
+
+    return map_chunks(one, data, chunk)
 
 
 @compiled(unit="points")
 def _conclude_slab(
-    data: tuple[Pair, Decision], *, procedure: InStages, read: Callable, chunk: int
+    data: tuple[Pair, Judgement], *, procedure: InSteps, read: Callable, chunk: int
 ) -> PyTree:
     return map_chunks(lambda one: read(one[0], procedure.conclude(*one)), data, chunk)
 

@@ -17,13 +17,14 @@ from ..geometry.pairs import Pair, double, pair, with_roots
 from ..orientation.result import PER_POINT, Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..rejection import AbstractProcedure, Rejection
-from ..rejection.base import Decision, InStages
+from ..rejection.base import InSteps
+from ..rejection.judgement import Judgement, nothing_known
 from ..xla.settings import keep_plain
 from ..xla.slabs import Progress, Split, silent
 from .batch import (
     clean_slabs,
     conclude_slabs,
-    decide_slabs,
+    judge_slabs,
     orient_slabs,
     orient_slabs_near,
     problem_of_all,
@@ -286,15 +287,15 @@ def clean_ragged(
     plan = _fitting(plan, pairs)
     out = _Out(pairs, progress)
     batches = _batches(pairs, plan.sizes, None, threads)
-    if not isinstance(procedure, InStages):
+    if not isinstance(procedure, InSteps):
         for members, size, slabs in batches:
             batch = pairs.pad_to(members, size)
             found = clean_slabs(batch, procedure, read, slabs, out.told)
             out.store(members, size, found)
     else:
-        decided = _decide(pairs, procedure, plan, threads, out.told)
+        known = _judge(pairs, procedure, plan, threads, out.told)
         for members, size, slabs in batches:
-            batch, own = pairs.pad_to(members, size), decided(members, size)
+            batch, own = pairs.pad_to(members, size), known(members, size)
             found = conclude_slabs(batch, own, procedure, read, slabs)
             out.store(members, size, found)
     if read is not decisions:
@@ -309,28 +310,29 @@ def clean_ragged(
     )
 
 
-def _decide(
-    pairs: Ragged, procedure: InStages, plan: Plan, threads: int | None, told: Progress
-) -> Callable[[Int[np.ndarray, " some"], int], Decision]:
-    """The decisions about all pairs, as a function of (members, size): the stages in
-    turn, each for the pairs that are still open."""
+def _judge(
+    pairs: Ragged, procedure: InSteps, plan: Plan, threads: int | None, told: Progress
+) -> Callable[[Int[np.ndarray, " some"], int], Judgement]:
+    """What is known of all pairs after the steps of a procedure, each for the pairs that
+    are open to it, as a function of (members, size)."""
     out = _Out(pairs, None)
-    open_, sizes = None, plan.sizes
-    for stage in procedure.separate():
+    out.tree = nothing_known(pairs.focal_left, pairs.mask).split()
+
+    def known(members: Int[np.ndarray, " some"], size: int) -> Judgement:
+        of_pairs, of_points = out.tree
+        padded = lambda rows: pairs._replace(mask=rows).pad_to(members, size).mask
+        own = jax.tree.map(lambda a: a[members], of_pairs)
+        return own.join(tuple(map(padded, of_points)))
+
+    sizes = plan.sizes
+    for step in procedure.steps():
+        open_ = np.flatnonzero(step.is_open(out.tree[0]))
         for members, size, slabs in _batches(pairs, sizes, None, threads, open_):
             batch = pairs.pad_to(members, size)
-            decision = decide_slabs(batch, stage, slabs, told)
-            of_pairs = decision._replace(use=None)
-            out.store(members, size, (of_pairs, decision.use))
-        open_, sizes, told = np.flatnonzero(~out.tree[0].believed), plan.fewer, silent
-    of_pairs, use = out.tree
-    used = pairs._replace(mask=use)
-
-    def decided(members: Int[np.ndarray, " some"], size: int) -> Decision:
-        own = jax.tree.map(lambda a: a[members], of_pairs)
-        return own._replace(use=used.pad_to(members, size).mask)
-
-    return decided
+            new = judge_slabs(batch, known(members, size), step, slabs, told)
+            out.store(members, size, new.split())
+        sizes, told = plan.fewer, silent
+    return known
 
 
 def _fitting(plan: Plan | None, pairs: Ragged) -> Plan:

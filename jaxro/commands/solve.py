@@ -23,6 +23,7 @@ from ..orientation.express import express
 from ..orientation.orient import Orientation, orient
 from ..orientation.results import RESULTS
 from ..rejection import AbstractProcedure, Rejection
+from ..rejection.base import InSteps
 from ..reports.columns import USABLE, Units, columns_of, is_usable
 from ..reports.model import Results
 from ..reports.reader import Assessor, Oriented, Reader
@@ -80,7 +81,10 @@ class Task:
     @property
     def cleaned_reader(self) -> "CleanedReader":
         """Reads what is wanted of a cleaned pair."""
-        return CleanedReader(self.reader, self.system, self.base, self.rounds)
+        # where there is one round, its log is read in any case: by one program, whose
+        # figures are the same to the last digit
+        rounds = self.rounds or isinstance(self.procedure, InSteps)
+        return CleanedReader(self.reader, self.system, self.base, rounds)
 
     @property
     def assessor(self) -> Assessor:
@@ -309,10 +313,10 @@ def _clean(
         )
     else:
         return _clean_with_rounds(pairs, task, plan, threads, told)
-    rounds = None
+    log, rounds = of_points.pop("rounds", None), None
     if task.rounds:
         of_round = jax.tree.map(lambda a: a[0], of_pair["rounds"])
-        rounds = read_rounds(of_round, of_points.pop("rounds"))
+        rounds = read_rounds(of_round, log)
     told_of = of_pair["pair"], of_points.pop("points")
     return Cleaned(*told_of, of_pair["outcome"], of_points, rounds)
 

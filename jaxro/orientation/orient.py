@@ -128,6 +128,21 @@ def orient_unchecked(pair: Pair, problem: Problem) -> Unchecked:
     return _solve(pair, problem)[0]
 
 
+def orient_from(pair: Pair, pose: RelativePose) -> Unchecked:
+    """The orientation from a pose near the right one but for `check_plane`, within a
+    compiled program."""
+    problem = Problem(
+        elements=RelativePose,
+        base=None,
+        residual=coplanarity.rigorous,
+        loss=None,
+        start=pose,
+        solver=None,
+        max_steps=None,
+    )
+    return compiled(orient_unchecked, settings=RUN_FAST)(pair, problem=problem)
+
+
 def orient_near(pair: Pair, problem: Problem) -> tuple[Unchecked, Bool[Array, ""]]:
     """The first part of an `Auto` start as an orientation of its own but for
     `check_plane`: from the vertical, and whether that fits."""

@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +46,12 @@ def state_sigma(pair: Pair, sigma: ScalarLike | None) -> Pair:
             "pair has covariances of its own: leave out the sigma of the procedure"
         )
     return dataclasses.replace(pair, sigma=jnp.full_like(pair.sigma, sigma))
+
+
+def scale_sigma(pair: Pair, scale: Float[Array, ""]) -> Pair:
+    """The pair with so many times the standard deviations."""
+    sigma = jnp.where(pair.mask, pair.sigma * scale, 1.0)
+    return eqx.tree_at(lambda pair: pair.sigma, pair, sigma)
 
 
 def familywise_limit(level: ScalarLike, pair: Pair) -> Float[Array, ""]:

@@ -2,19 +2,20 @@
 
 import abc
 import dataclasses
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, double, first_points, pad, quickly, room_for
 from ..orientation.orient import Orientation
 from ..xla.passes import count
 from ..xla.programs import compiled, is_traced
+from .judgement import AbstractStep, Judgement, nothing_known
 
 PointValues = Float[Array, "*pairs point"]
 
@@ -155,9 +156,8 @@ class AbstractProcedure(eqx.Module):
         if is_traced((pair, self)):
             return clean(pair, procedure=self)
         procedure, pair = take_sigma(self, pad(pair, room_for(points)))
-        if isinstance(procedure, InStages):
-            decision = decide_in_turn(procedure, pair)
-            found = conclude(pair, decision, procedure=procedure)
+        if isinstance(procedure, InSteps):
+            found = _in_steps(pair, procedure)
         else:
             found = clean(pair, procedure=procedure)
         return found.first(points)
@@ -178,48 +178,44 @@ def take_sigma(
     return procedure, eqx.tree_at(lambda pair: pair.sigma, pair, stated)
 
 
-class Decision(NamedTuple):
-    """The pose, the points that agree with it, whether that is believed, and the factor
-    of the standard deviations of the pair by which they were judged."""
-
-    pose: RelativePose
-    use: Bool[Array, "*pairs point"]
-    believed: Bool[Array, "*pairs"]
-    scale: Float[Array, "*pairs"]
-
-
-class AbstractDecider(eqx.Module):
-    """A stage of a procedure: it decides on a pair, or leaves it open."""
-
-    @abc.abstractmethod
-    def decide(self, pair: Pair) -> Decision:
-        """The decision about one pair; works under jit and vmap."""
-
-
 @runtime_checkable
-class InStages(Protocol):
-    """A procedure that decides in stages, each for the pairs that the one before left
-    open, and concludes from the decision. Each stage and the conclusion are programs of
-    their own: small ones, and only those that some pair needs."""
+class InSteps(Protocol):
+    """A procedure that judges in steps, and concludes from what is known then. Each
+    step and the conclusion are programs of their own: small ones, and only those that
+    some pair needs."""
 
-    def separate(self) -> list[AbstractDecider]:
-        """The stages in turn."""
+    def steps(self) -> list[AbstractStep]:
+        """The steps in turn."""
         ...
 
-    def conclude(self, pair: Pair, decision: Decision) -> Rejection:
-        """The result that follows from the decision about one pair."""
+    def is_usual(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        """Whether `conclude_usual` may do for pairs of which so much is known; in NumPy
+        or JAX."""
+        ...
+
+    def conclude_usual(
+        self, pair: Pair, known: Judgement
+    ) -> tuple[Rejection, Bool[Array, ""]]:
+        """The conclusion without what few pairs need, and whether it holds."""
+        ...
+
+    def conclude(self, pair: Pair, known: Judgement) -> Rejection:
+        """The result that follows from what is known of a pair."""
         ...
 
 
-def decide_in_turn(procedure: InStages, pair: Pair) -> Decision:
-    """The decision of the first stage that is believed, or else of the last."""
-    first, *others = procedure.separate()
-    decision = decide(pair, stage=first)
-    for stage in others:
-        if bool(decision.believed):
-            break
-        decision = decide(pair, stage=stage)
-    return decision
+def _in_steps(pair: Pair, procedure: InSteps) -> Rejection:
+    """The result for one pair by the programs that it needs."""
+    known = nothing_known(*jax.tree.map(np.asarray, (pair.focal_left, pair.mask)))
+    for step in procedure.steps():
+        if bool(step.is_open(known)):
+            known = judge(pair, known, step=step)
+            known = jax.tree.map(np.asarray, known)
+    if bool(procedure.is_usual(known)):
+        found, holds = conclude_usual(pair, known, procedure=procedure)
+        if bool(holds):
+            return found
+    return conclude(pair, known, procedure=procedure)
 
 
 @compiled(settings=quickly, unit="points")
@@ -229,12 +225,20 @@ def clean(pair: Pair, *, procedure: AbstractProcedure) -> Rejection:
 
 
 @compiled(settings=quickly, unit="points")
-def decide(pair: Pair, *, stage: AbstractDecider) -> Decision:
-    """The decision of a stage, as a program."""
-    return stage.decide(pair)
+def judge(pair: Pair, known: Judgement, *, step: AbstractStep) -> Judgement:
+    """The judgement after a step, as a program."""
+    return step.judge(pair, known)
 
 
 @compiled(settings=quickly, unit="points")
-def conclude(pair: Pair, decision: Decision, *, procedure: InStages) -> Rejection:
+def conclude_usual(
+    pair: Pair, known: Judgement, *, procedure: InSteps
+) -> tuple[Rejection, Bool[Array, ""]]:
+    """The conclusion for the usual pair, as a program."""
+    return procedure.conclude_usual(pair, known)
+
+
+@compiled(settings=quickly, unit="points")
+def conclude(pair: Pair, known: Judgement, *, procedure: InSteps) -> Rejection:
     """The conclusion of a procedure, as a program."""
-    return procedure.conclude(pair, decision)
+    return procedure.conclude(pair, known)

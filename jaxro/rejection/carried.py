@@ -18,7 +18,7 @@ where d of the points choose the base freely (compare `evidence.log_accidents`).
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,11 +36,13 @@ from ..orientation.orient import Orientation
 from ..orientation.results import RESULTS
 from ..orientation.starts.general import rotation_only, vectors
 from ..orientation.verdict import WEAK, largest_variance
-from ..xla.kernels import if_needed, while_loop
+from ..xla.kernels import while_loop
 from ..xla.passes import count
 from .agreement import keep_agreeing, points_within, squares
 from .evidence import chance_of_agreement
-from .masked import Use, sum_of
+from .judgement import AbstractStep, Judgement, Witnesses
+from .level import Level
+from .masked import Use, choose, sum_of
 from .stages import FLAT, ROUNDS
 from .steps import narrow, normal_equations
 from .subsets import choose_places, draw, move_up
@@ -74,92 +76,84 @@ PARALLEL = 3.5
 """Standard deviations of the angle between two rays up to which they are parallel."""
 
 
-class Witnesses(NamedTuple):
-    """What is to be said of a base: that a rotation explains the others (`turned`),
-    that few points carry it (`few`), or that the other pose of a plane explains the
-    others (`second`); the `rotation`, and the points that it explains; the `chance`
-    that a wrong point agrees."""
+class IsCarried(AbstractStep):
+    """Whether a rotation explains all points but few, which then is the pose, with all
+    points that it explains; or else whether few points carry the base."""
 
-    turned: Bool[Array, ""]
-    few: Bool[Array, ""]
-    second: Bool[Array, ""]
-    rotation: RelativePose
-    still: Use
-    chance: Float[Array, ""]
+    level: Level
 
-    @property
-    def carried(self) -> Bool[Array, ""]:
-        """Whether the base is one, and many points carry it."""
-        return ~(self.turned | self.few)
+    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        return known.decision.believed
 
-    def judge(self, orientation: Orientation) -> Orientation:
-        """The orientation with what the witnesses say, where it is else successful or
-        has no base."""
-        result = orientation.result
-        fine = result == RESULTS.successful
-        result = RESULTS.where(fine & self.second, RESULTS.two_solutions, result)
-        result = RESULTS.where(fine & self.few, RESULTS.carried_by_few, result)
-        result = RESULTS.where(self.turned, RESULTS.zero_base, result)
-        return dataclasses.replace(orientation, result=result)
+    def judge(self, pair: Pair, known: Judgement) -> Judgement:
+        """With what is said of the base but for the other pose of a plane."""
+        pose, use, _, scale = known.decision
+        pair, limit = self.level.judged_by(pair, scale), self.level.limit(pair)
+        freedom = count(use) - 5
+        square = sum_of(squares(pair, pose), use) / jnp.maximum(freedom, 1.0)
+        sigma0 = jnp.where(freedom > degeneracy.FEW, jnp.sqrt(square), 1.0)
+        # of so many points a chance is not known to be less than that of one of them
+        least = 1 / jnp.maximum(count(pair.mask), 1.0)
+        chance = jnp.maximum(chance_of_agreement(pair, pose, use, limit), least)
+        out = pair.mask & ~use
+        any_out = count(out) > 0
 
+        rotation, still = turn_only(pair, use)
+        explained = count(use & still)
+        apart = _by_accident(count(use & ~still), count(pair.mask & ~still), chance, 2)
+        turned = apart & (explained >= 0.5 * count(use)) & (explained > FEW)
 
-def witnesses(
-    pair: Pair,
-    pose: RelativePose,
-    use: Use,
-    asked: Bool[Array, ""],
-    limit: Float[Array, ""],
-) -> Witnesses:
-    """`Witnesses` of the base of a pose by the points in use, where they are `asked`;
-    `pair` without unusable points, with the sigma that the points were judged by."""
-    no = asked & False
-    silent = Witnesses(no, no, no, pose, use, jnp.ones_like(limit))
-    ask = lambda asked: _ask(
-        pair.with_mask(pair.mask & asked), pose, use & asked, limit
-    )
-    return if_needed(asked, ask, silent)
+        needed, found = carriers(pair, pose, use, sigma0)
+        few = found & _by_accident(count(needed), count(needed | out), chance, 2)
+
+        plane = planes.plane(pair, pose, use, limit)
+        base = Witnesses(
+            turned=turned,
+            few=few & any_out & ~turned,
+            flat=(plane.share >= FLAT) & any_out & ~turned,
+            second=any_out & False,
+            chance=chance,
+        )
+        decision = known.decision._replace(
+            pose=choose(turned, rotation, pose), use=jnp.where(turned, still, use)
+        )
+        return known.decided(pair, decision)._replace(base=base)
 
 
-def _ask(
-    pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]
-) -> Witnesses:
-    """`Witnesses` of a pair of which they are asked."""
-    pair = mask_unusable(pair)[0]
-    freedom = count(use) - 5
-    square = sum_of(squares(pair, pose), use) / jnp.maximum(freedom, 1.0)
-    sigma0 = jnp.where(freedom > degeneracy.FEW, jnp.sqrt(square), 1.0)
-    # of so many points a chance is not known to be less than that of one of them
-    least = 1 / jnp.maximum(count(pair.mask), 1.0)
-    chance = jnp.maximum(chance_of_agreement(pair, pose, use, limit), least)
-    out = pair.mask & ~use
+class HasSecond(AbstractStep):
+    """Whether the other pose of the plane of the points explains all but few."""
 
-    rotation, still = turn_only(pair, use)
-    explained = count(use & still)
-    apart = _by_accident(count(use & ~still), count(pair.mask & ~still), chance, 2)
-    turned = apart & (explained >= 0.5 * count(use)) & (explained > FEW)
+    level: Level
 
-    needed, found = carriers(pair, pose, use, sigma0)
-    few = found & _by_accident(count(needed), count(needed | out), chance, 2)
+    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        return known.decision.believed & known.base.flat
 
-    others, flat = _points_of_other_pose(pair, pose, use, limit)
-    chosen = _by_accident(count(use & ~others), count(pair.mask & ~others), chance, 0)
-    any_out = count(out) > 0
-    return Witnesses(
-        turned=turned,
-        few=few & any_out & ~turned,
-        second=flat & chosen & any_out,
-        rotation=rotation,
-        still=still,
-        chance=chance,
-    )
+    def judge(self, pair: Pair, known: Judgement) -> Judgement:
+        """With the word on the other pose."""
+        pose, use, _, scale = known.decision
+        pair, limit = self.level.judged_by(pair, scale), self.level.limit(pair)
+        others, fits = _points_of_other_pose(pair, pose, use, limit)
+        agree, of = count(use & ~others), count(pair.mask & ~others)
+        chosen = _by_accident(agree, of, known.base.chance, 0)
+        return known._replace(base=known.base._replace(second=fits & chosen))
+
+
+def judge_base(base: Witnesses, orientation: Orientation) -> Orientation:
+    """The orientation with what the witnesses say of its base, where it is else
+    successful or has no base."""
+    result = orientation.result
+    fine = result == RESULTS.successful
+    result = RESULTS.where(fine & base.second, RESULTS.two_solutions, result)
+    result = RESULTS.where(fine & base.few, RESULTS.carried_by_few, result)
+    result = RESULTS.where(base.turned, RESULTS.zero_base, result)
+    return dataclasses.replace(orientation, result=result)
 
 
 def _points_of_other_pose(
     pair: Pair, pose: RelativePose, use: Use, limit: Float[Array, ""]
 ) -> tuple[Use, Bool[Array, ""]]:
     """The points that agree with the other pose of the plane of those in use, and
-    whether there is one, enough points lie in the plane, and those that agree with both
-    fit it as well."""
+    whether there is one, and those that agree with both fit it as well."""
     plane = planes.plane(pair, pose, use, limit)
     in_plane = mask_unusable(pair.with_mask(plane.within))[0]
     other, exists = planes.second(in_plane, pose, plane.normal)
@@ -170,7 +164,7 @@ def _points_of_other_pose(
     both = use & agree
     here, there = (sum_of(squares(pair, p), both) for p in (pose, other))
     fits = there <= here * degeneracy.excess(count(both) - 5)
-    return agree, exists & (plane.share >= FLAT) & fits
+    return agree, exists & fits
 
 
 def turn_only(pair: Pair, use: Use) -> tuple[RelativePose, Use]:

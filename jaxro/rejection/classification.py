@@ -73,7 +73,7 @@ class Verdict(NamedTuple):
     outcome: OUTCOMES
 
 
-def verdict(rejection: Rejection) -> Verdict:
+def verdict(_: Pair, rejection: Rejection) -> Verdict:
     """The part of a rejection that is needed here."""
     solved = rejection.orientation
     return Verdict(rejection.mask, solved.pose, solved.result, rejection.outcome)

@@ -111,21 +111,21 @@ class Fading(NamedTuple):
 
 
 def fade(pair: Pair, pose: RelativePose, use: Use) -> Fading:
-    """`Fading` of the points in use, where it is needed (`_is_heavy`); else all factors
+    """`Fading` of the points in use, where it is needed (`is_heavy`); else all factors
     are 1. `pose`: of the points in use."""
     fixed = lax.stop_gradient(pair)
-    needed = _is_heavy(fixed, squares(fixed, pose), use)
+    needed = is_heavy(fixed, pose, use)
     factors = lambda needed: _factors(fixed, pose, use & needed)
     one = jnp.ones_like(pair.focal_left)
     factor, noise = if_needed(needed, factors, (jnp.ones_like(pair.sigma), one))
     return Fading(needed, factor, noise)
 
 
-def _is_heavy(pair: Pair, s: Values, use: Use) -> Bool[Array, ""]:
+def is_heavy(pair: Pair, pose: RelativePose, use: Use) -> Bool[Array, ""]:
     """Whether the mean fourth power of the residuals exceeds the one of normal
     residuals by more than chance, or the points left out are so many and so near that
     some wrong points agree by accident."""
-    k = jnp.maximum(count(use), 1.0)
+    s, k = squares(pair, pose), jnp.maximum(count(use), 1.0)
     out = pair.mask & ~use
     mean = mean_of(s, use)
     fourth = mean_of(s * s, use)

@@ -9,8 +9,8 @@ from ..geometry.pairs import Pair
 from ..xla.passes import count
 from . import evidence
 from .agreement import normalised_residuals
-from .base import Decision
 from .graduated_non_convexity import GraduatedNonConvexity
+from .judgement import Decision
 from .search import forward
 from .stages import AbstractStage, believe_if_it_fits, on_a_plane, settle
 from .steps import from_vertical

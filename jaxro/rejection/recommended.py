@@ -16,93 +16,27 @@ points, which finds few and small errors best.
 """
 
 import dataclasses
+from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Bool, Float, ScalarLike
+from jaxtyping import Array, Bool, ScalarLike
 
 from ..assessment.undecided import undecided_points
-from ..geometry.elements import RelativePose, vertical
 from ..geometry.linear import linearise
-from ..geometry.pairs import Pair, mask_unusable
-from ..xla.kernels import if_needed
-from ..xla.passes import count
-from .agreement import familywise_limit, normalised_residuals, state_sigma
-from .base import OUTCOMES, AbstractDecider, AbstractProcedure, Decision, Rejection
-from .carried import witnesses
+from ..geometry.pairs import Pair
+from ..orientation.orient import Orientation, orient_from
+from ..orientation.verdict import check_plane
+from .agreement import normalised_residuals, scale_sigma
+from .base import OUTCOMES, AbstractProcedure, Rejection
+from .carried import HasSecond, IsCarried, judge_base
 from .fading import fade
-from .masked import Use, choose
+from .judgement import AbstractStep, Judgement, if_open, nothing_known
+from .level import Level
 from .quick import Plain, Quick
-from .stages import FEW, AbstractStage, scale_sigma
+from .stages import FEW, AbstractStage, Decides
 from .thorough import Thorough
-from .unchecked import without_unchecked
-from .verdict import verdict
+from .unchecked import IsChecked
+from .verdict import testable, verdict_on
 from .visibility import seen
-
-UNKNOWN = 3000.0
-"""Where nothing is said of the noise, a search begins with this part of the focal
-length."""
-
-
-class Level(eqx.Module):
-    """By what points are judged: `sigma`, `level` and `known` of `Recommended`."""
-
-    sigma: ScalarLike | None
-    level: ScalarLike
-    known: bool
-
-    def state(self, pair: Pair) -> Pair:
-        """The pair without unusable points, with this sigma."""
-        return state_sigma(mask_unusable(pair)[0], self.sigma)
-
-    def first_sigma(self, pair: Pair) -> Float[Array, ""]:
-        """The factor of the standard deviations with which a search begins."""
-        if self.known:
-            return jnp.ones_like(pair.focal_left)
-        if pair.roots is not None:
-            return jnp.ones_like(pair.focal_left)
-        stated = count(pair.mask & (pair.sigma != 1)) > 0
-        return jnp.where(stated, 1.0, pair.focal_left / UNKNOWN)
-
-    def limit(self, pair: Pair) -> Float[Array, ""]:
-        """The limit of |w|."""
-        return familywise_limit(self.level, pair)
-
-
-class Stages(AbstractDecider):
-    """Stages in turn, each for the pairs that the one before did not believe."""
-
-    stages: tuple[AbstractStage, ...]
-    level: Level
-
-    def decide(self, pair: Pair) -> Decision:
-        """The decision of the first stage that is believed, or else of the last."""
-        pair = lax.stop_gradient(self.level.state(pair))  # it has no derivative
-        pair = scale_sigma(pair, self.level.first_sigma(pair))
-        limit = self.level.limit(pair)
-        zero = jnp.zeros_like(limit)
-        decision = Decision(
-            pose=vertical(zero),
-            use=pair.mask & False,
-            believed=zero > 0,
-            scale=zero + 1,
-        )
-        for stage in self.stages:
-            decision = _decide_where_open(stage, pair, limit, decision)
-        return decision
-
-
-def _decide_where_open(
-    stage: AbstractStage, pair: Pair, limit: Float[Array, ""], before: Decision
-) -> Decision:
-    """The decision of a stage where none was believed yet."""
-
-    def decide(is_open: Bool[Array, ""]) -> Decision:
-        own = pair.with_mask(pair.mask & is_open)
-        return stage(mask_unusable(own)[0], limit)
-
-    return if_needed(~before.believed, decide, before)
 
 
 class Recommended(AbstractProcedure):
@@ -127,36 +61,55 @@ class Recommended(AbstractProcedure):
     known: bool = True
 
     def clean(self, pair: Pair) -> Rejection:
-        every = Stages(self._deciding, self._level)
-        return self.conclude(pair, every.decide(pair))
+        known = nothing_known(pair.focal_left, pair.mask)
+        decide = [Decides(stage, self._level) for stage in self._deciding]
+        for step in (*decide, *self._checks):
+            known = if_open(step, pair, known)
+        return self.conclude(pair, known)
 
-    def separate(self) -> list[AbstractDecider]:
-        """Every stage by itself."""
-        parts = [(stage,) for stage in self._deciding] or [()]
-        return [Stages(part, self._level) for part in parts]
+    def steps(self) -> list[AbstractStep]:
+        """Those of every stage, then what is asked of what they found."""
+        level = self._level
+        decide = [step for stage in self._deciding for step in stage.as_steps(level)]
+        return [*decide, *self._checks]
 
-    def conclude(self, pair: Pair, decision: Decision) -> Rejection:
-        """The result that follows from a decision."""
-        pose, use, believed, scale = decision
+    def is_usual(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        return ~(known.heavy & known.decision.believed)
+
+    def conclude_usual(
+        self, pair: Pair, known: Judgement
+    ) -> tuple[Rejection, Bool[Array, ""]]:
+        pair, use = self._level.state(pair), known.decision.use
+        used = pair.with_mask(testable(pair, use))
+        solved, plane = orient_from(used, known.decision.pose)
+        return self._tell(pair, known, solved), ~plane
+
+    def conclude(self, pair: Pair, known: Judgement) -> Rejection:
+        pose, use, believed, scale = known.decision
         pair = self._level.state(pair)
-        fixed = lax.stop_gradient(pair)
-        scale = scale * self._level.first_sigma(fixed)
-        fixed = scale_sigma(fixed, scale)
-        limit = self._level.limit(pair)
-        base = witnesses(fixed, pose, use, believed, limit)
-        use = jnp.where(base.turned, base.still, use)
-        pose = choose(base.turned, base.rotation, pose)
-        pose, use = without_unchecked(
-            fixed, pose, use, limit, base.chance, believed & base.carried
-        )
-        w = normalised_residuals(linearise(fixed, pose), use)
+        scale = scale * self._level.first_sigma(pair)
         fading = fade(scale_sigma(pair, scale), pose, use & believed)
         fading = fading._replace(noise=fading.noise * scale)
-        judge = lambda solved: base.judge(fading.spread(pair, use, solved))
-        result = verdict(fading.weaken(pair), pose, use, limit, w, judge)
+        used = fading.weaken(pair).with_mask(testable(pair, use))
+        solved = check_plane(used, *orient_from(used, pose))
+        return self._tell(pair, known, fading.spread(pair, use, solved))
+
+    def _tell(self, pair: Pair, known: Judgement, solved: Orientation) -> Rejection:
+        """The result with this orientation."""
+        pose, use, believed, scale = known.decision
+        judged_by = self._level.judged_by(pair, scale)
+        w = normalised_residuals(linearise(judged_by, pose), use)
+        solved = judge_base(known.base, solved)
+        limit = self._level.limit(pair)
+        result = verdict_on(pair, solved, testable(pair, use), limit, w)
         result = result.only_if(believed, OUTCOMES.no_consensus)
-        carried = believed & ~base.turned
-        return result.take_back(_in_doubt(fixed, pose, use, carried))
+        return result.take_back(known.doubtful)
+
+    @property
+    def _checks(self) -> tuple[AbstractStep, ...]:
+        """What is asked of a decision that is believed."""
+        of = self._level
+        return IsCarried(of), HasSecond(of), IsChecked(of), IsInDoubt(of)
 
     @property
     def _level(self) -> Level:
@@ -171,17 +124,19 @@ class Recommended(AbstractProcedure):
         return tuple(dataclasses.replace(stage, known=False) for stage in searches)
 
 
-def _in_doubt(
-    pair: Pair, pose: RelativePose, use: Use, believed: Bool[Array, ""]
-) -> Use:
-    """The points of which some are wrong, though nothing tells which; only of pairs
-    with few points out."""
-    out = pair.mask & ~use
-    asked = believed & (count(out) > 0) & (count(out) <= FEW)
+class IsInDoubt(AbstractStep):
+    """The points of which some are wrong, though nothing tells which; only of pairs with
+    few points out."""
 
-    def find(asked: Bool[Array, ""]) -> Use:
-        own = pair.with_mask(pair.mask & asked)
-        wrong = out & asked & seen(own, pose, 0.0)
-        return undecided_points(own, pose, use & asked, wrong)
+    level: Level
 
-    return if_needed(asked, find, jnp.zeros_like(use))
+    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        some = (known.out > 0) & (known.out <= FEW)
+        return known.decision.believed & ~known.base.turned & some
+
+    def judge(self, pair: Pair, known: Judgement) -> Judgement:
+        """With the doubtful points."""
+        pose, use, _, scale = known.decision
+        pair = self.level.judged_by(pair, scale)
+        wrong = pair.mask & ~use & seen(pair, pose, 0.0)
+        return known._replace(doubtful=undecided_points(pair, pose, use, wrong))

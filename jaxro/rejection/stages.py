@@ -2,6 +2,7 @@
 one. Another stage is another `AbstractStage`; here stands what stages share."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +16,8 @@ from ..orientation import planes
 from ..xla.passes import count
 from . import evidence
 from .agreement import keep_agreeing, one_by_one, points_within, squares
-from .base import Decision
+from .judgement import AbstractStep, Decision, Judgement
+from .level import Level
 from .masked import Use, choose
 from .visibility import seen
 
@@ -43,6 +45,25 @@ class AbstractStage(eqx.Module):
     @abc.abstractmethod
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
         """Decide on one pair by |w| <= limit."""
+
+    def as_steps(self, level: Level) -> tuple[AbstractStep, ...]:
+        """The steps that it is made of."""
+        return (Decides(self, level),)
+
+
+class Decides(AbstractStep):
+    """A stage as one step."""
+
+    stage: AbstractStage
+    level: Level
+
+    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        return ~known.decision.believed
+
+    def judge(self, pair: Pair, known: Judgement) -> Judgement:
+        """With the decision of the stage."""
+        decision = self.stage(self.level.first(pair), self.level.limit(pair))
+        return self.level.decide(pair, known, decision)
 
 
 def settle(
@@ -113,9 +134,3 @@ def on_a_plane(
     out = pair.mask & ~use
     flat = plane.share >= FLAT
     return facing, plane, flat & (count(out) > 0)
-
-
-def scale_sigma(pair: Pair, scale: Float[Array, ""]) -> Pair:
-    """The pair with so many times the standard deviations."""
-    sigma = jnp.where(pair.mask, pair.sigma * scale, 1.0)
-    return eqx.tree_at(lambda pair: pair.sigma, pair, sigma)

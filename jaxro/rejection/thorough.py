@@ -2,23 +2,24 @@
 it finds."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
-from ..geometry.elements import RelativePose, vertical
+from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation import planes
 from ..xla.kernels import if_needed, while_loop
 from ..xla.passes import count
 from . import evidence
-from .agreement import points_within, squares
-from .base import Decision
+from .agreement import points_within, scale_sigma, squares
 from .graduated_non_convexity import GraduatedNonConvexity
 from .hypotheses import Newton, best
+from .judgement import AbstractStep, Decision, Judgement, Sought, nothing_known
+from .level import Level
 from .masked import Use, choose, sum_of
 from .noise import noise_of
 from .ransac import Ransac
@@ -27,7 +28,6 @@ from .stages import (
     AbstractStage,
     believe_if_it_fits,
     on_a_plane,
-    scale_sigma,
     settle,
 )
 from .steps import from_vertical, narrow
@@ -76,16 +76,6 @@ class Turn(NamedTuple):
     found: Found
 
 
-class Sought(NamedTuple):
-    """The state between searches among fewer and fewer points: how many there were,
-    whether another one is needed, the points that it is to search, and the decision."""
-
-    number: Int[Array, ""]
-    again: Bool[Array, ""]
-    among: Use
-    decision: Decision
-
-
 class Thorough(AbstractStage):
     """Random subsets in any position until a better orientation would have been met,
     and the evidence for what is found.
@@ -120,47 +110,53 @@ class Thorough(AbstractStage):
     known: bool = True
 
     def __call__(self, pair: Pair, limit: Float[Array, ""]) -> Decision:
-        def turn(state: Sought) -> Sought:
-            own = mask_unusable(pair.with_mask(state.among))[0]
-            found, scale = self._search(own, self._near_vertical(own), limit)
-            decision, alike = self._decide(pair, found, scale, limit)
-            first = state.number == 0
-            taken = choose(first | decision.believed, decision, state.decision)
-            return Sought(
-                number=state.number + 1,
-                again=alike & (state.number < ALIKE),
-                among=state.among & ~decision.use,
-                decision=taken,
-            )
+        known = nothing_known(pair.focal_left, pair.mask)
+        sought = known.sought._replace(again=count(pair.mask) > 0)
 
-        nothing = Decision(
-            pose=vertical(jnp.zeros_like(limit)),
-            use=pair.mask & False,
-            believed=limit < 0,
-            scale=jnp.ones_like(limit),
-        )
-        asked = count(pair.mask) > 0
-        start = Sought(jnp.zeros((), int), asked, pair.mask, nothing)
-        more = lambda state: state.again
-        return while_loop(more, turn, start, pair.focal_left).decision
+        def turn(state: tuple[Decision, Sought]) -> tuple[Decision, Sought]:
+            decision, sought = state
+            return self.settle(pair, decision, self.seek(pair, sought, limit), limit)
 
-    def _decide(
-        self, pair: Pair, found: Found, scale: Float[Array, ""], limit: Float[Array, ""]
-    ) -> tuple[Decision, Bool[Array, ""]]:
-        """What is found, with all points judged; and whether it is no accident but for
-        what its points have in common: they lie at few places."""
-        pair = scale_sigma(pair, scale)
-        pose, use = _settle_better_pose(pair, found.pose, limit)
+        more = lambda state: state[1].again
+        start = known.decision, sought
+        return while_loop(more, turn, start, pair.focal_left)[0]
+
+    def as_steps(self, level: Level) -> tuple[AbstractStep, ...]:
+        """The search and what becomes of it, by programs of their own."""
+        return (Seeks(self, level), Settles(self, level)) * (1 + ALIKE)
+
+    def seek(self, pair: Pair, sought: Sought, limit: Float[Array, ""]) -> Sought:
+        """What is found among the points that are left to search."""
+        own = mask_unusable(pair.with_mask(pair.mask & sought.among))[0]
+        found, scale = self._search(own, self._near_vertical(own), limit)
+        return sought._replace(found=found, scale=scale)
+
+    def settle(
+        self, pair: Pair, before: Decision, sought: Sought, limit: Float[Array, ""]
+    ) -> tuple[Decision, Sought]:
+        """The decision by what was found, or that of before where this is not believed;
+        and where to search again: where what was found is no accident but for what its
+        points have in common, that they lie at few places, among all others."""
+        found, scale = sought.found, sought.scale
+        own = scale_sigma(pair, scale)
+        pose, use = _settle_better_pose(own, found.pose, limit)
         at_once = self.known & believe_if_it_fits(
-            pair, pose, use, limit, self.share, self.accidents_at_once
+            own, pose, use, limit, self.share, self.accidents_at_once
         )
         # one after the other, so that it is compiled once
-        judge = lambda among: self._is_certain(pair, pose, use, among, found, limit)
-        sets = jnp.stack([evidence.apart(pair), pair.mask])
+        judge = lambda among: self._is_certain(own, pose, use, among, found, limit)
+        sets = jnp.stack([evidence.apart(own), own.mask])
         certain, by_points = lax.map(judge, sets)
         believed = at_once | certain
         decision = Decision(pose=pose, use=use, believed=believed, scale=scale)
-        return decision, by_points & ~believed
+        first = sought.number == 0
+        alike = by_points & ~believed
+        sought = sought._replace(
+            number=sought.number + 1,
+            again=alike & (sought.number < ALIKE),
+            among=sought.among & ~use,
+        )
+        return choose(first | believed, decision, before), sought
 
     def _is_certain(
         self,
@@ -266,6 +262,38 @@ class Thorough(AbstractStage):
         poses = jax.tree.map(lambda *each: jnp.stack(each), *found)
         costs = lax.map(lambda pose: cost_of(pair, pose, self.search.limit), poses)
         return best(poses, costs)
+
+
+class Seeks(AbstractStep):
+    """The search of `Thorough`."""
+
+    stage: Thorough
+    level: Level
+
+    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        return ~known.decision.believed & known.sought.again
+
+    def judge(self, pair: Pair, known: Judgement) -> Judgement:
+        """With what is found."""
+        own, limit = self.level.first(pair), self.level.limit(pair)
+        return known._replace(sought=self.stage.seek(own, known.sought, limit))
+
+
+class Settles(AbstractStep):
+    """What becomes of the search of `Thorough`."""
+
+    stage: Thorough
+    level: Level
+
+    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        return ~known.decision.believed & known.sought.again
+
+    def judge(self, pair: Pair, known: Judgement) -> Judgement:
+        """With the decision, and whether the search is to begin again."""
+        own, limit = self.level.first(pair), self.level.limit(pair)
+        of = known.decision, known.sought
+        decision, sought = self.stage.settle(own, *of, limit)
+        return self.level.decide(pair, known, decision)._replace(sought=sought)
 
 
 class Settled(NamedTuple):

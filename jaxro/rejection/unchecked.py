@@ -18,7 +18,7 @@ out: the deviations of the pose without them are true, whether they are right or
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -32,6 +32,8 @@ from ..geometry.pairs import Pair
 from ..xla.kernels import while_loop
 from ..xla.passes import count
 from .agreement import keep_agreeing
+from .judgement import AbstractStep, Judgement
+from .level import Level
 from .masked import Use, choose
 from .stages import ROUNDS
 from .steps import normal_equations
@@ -55,6 +57,25 @@ TURNS = 4
 """Poses that are looked at, at most."""
 
 
+class IsChecked(AbstractStep):
+    """The pose of the points in use that the others check, and these points, judged
+    anew by |w| <= limit; where points are out."""
+
+    level: Level
+
+    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        carried = ~(known.base.turned | known.base.few)
+        some = (known.out > 0) & (known.kept >= PART)
+        return known.decision.believed & carried & some
+
+    def judge(self, pair: Pair, known: Judgement) -> Judgement:
+        """With the decision that only such points are in use."""
+        pose, use, _, scale = known.decision
+        pair, limit = self.level.judged_by(pair, scale), self.level.limit(pair)
+        pose, use = without_unchecked(pair, pose, use, limit, known.base.chance)
+        return known.decided(pair, known.decision._replace(pose=pose, use=use))
+
+
 class Checked(NamedTuple):
     """A pose, and the points in use that the others check."""
 
@@ -68,16 +89,14 @@ def without_unchecked(
     use: Use,
     limit: Float[Array, ""],
     chance: Float[Array, ""],
-    asked: Bool[Array, ""],
 ) -> Checked:
     """The pose of the points in use that the others check, and these points, judged
-    anew by |w| <= limit; as they are where it is not `asked`, or where no point is out.
+    anew by |w| <= limit.
 
     `chance`: that of a wrong point to agree with the pose. The pose without a wrong
     point may suit another one, so that it is done again until all are checked.
     """
     most = count(use) / PART
-    asked = asked & (count(pair.mask & ~use) > 0) & (most >= 1)
 
     def turn(state):
         k, _, (pose, use), doubted = state
@@ -89,7 +108,7 @@ def without_unchecked(
         new = Checked(new[0], new[1] & seen(own, new[0], limit))
         return k + 1, some, choose(some, new, Checked(pose, use)), doubted
 
-    start = jnp.zeros((), int), asked, Checked(pose, use), use & False
+    start = jnp.zeros((), int), most >= 1, Checked(pose, use), use & False
     more = lambda state: state[1] & (state[0] < TURNS)
     *_, found, _ = while_loop(more, turn, start, pair.focal_left)
     return found

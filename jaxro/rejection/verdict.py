@@ -1,7 +1,6 @@
 """The verdict of procedures that find the pose first, and the wrong points by it."""
 
 import abc
-from collections.abc import Callable
 
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
@@ -32,21 +31,30 @@ def verdict(
     use: Use,
     limit: ArrayLike,
     w: Values | None = None,
-    judge: Callable[[Orientation], Orientation] = lambda solved: solved,
 ) -> Rejection:
-    """The result that only the points in `use` are right, with their orientation as
-    `judge` corrects it.
+    """The result that only the points in `use` are right, with their orientation.
 
     The evidence is |w| against the limit: the `w` by which the points were chosen, or
-    else the one of this orientation; it is infinite for a point that was rejected as it
-    cannot be seen. Of five points and fewer none can be tested.
+    else the one of this orientation. Of five points and fewer none can be tested.
     """
-    enough = count(pair.mask) > 5
-    use = jnp.where(enough, use, pair.mask)
-    solved = orient(pair.with_mask(use), start=pose)
+    used = testable(pair, use)
+    solved = orient(pair.with_mask(used), start=pose)
     if w is None:
-        w = normalised_residuals(linearise(pair, solved.pose), use)
-    solved = judge(solved)
+        w = normalised_residuals(linearise(pair, solved.pose), used)
+    return verdict_on(pair, solved, used, limit, w)
+
+
+def testable(pair: Pair, use: Use) -> Use:
+    """The points in use; of five points and fewer all."""
+    return jnp.where(count(pair.mask) > 5, use, pair.mask)
+
+
+def verdict_on(
+    pair: Pair, solved: Orientation, use: Use, limit: ArrayLike, w: Values
+) -> Rejection:
+    """The result that only the points in `use`, which have this orientation, are right,
+    as |w| says; it is infinite for a point that was rejected as it cannot be seen."""
+    enough = count(pair.mask) > 5
     limit = jnp.asarray(limit, w.dtype)
     unseen = ~use & (w <= limit) & ~seen(pair, solved.pose, limit)
     w = jnp.where(unseen, jnp.inf, w)

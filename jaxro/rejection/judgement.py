@@ -1,0 +1,154 @@
+"""What is known of a pair after some steps of a procedure that judges in steps, and what
+such a step is."""
+
+import abc
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..geometry.elements import RelativePose, vertical
+from ..geometry.pairs import Pair
+from ..xla.kernels import if_needed
+from ..xla.passes import count
+from .fading import is_heavy
+from .search import Found
+
+
+class Decision(NamedTuple):
+    """The pose, the points that agree with it, whether that is believed, and the factor
+    of the standard deviations of the pair by which they were judged."""
+
+    pose: RelativePose
+    use: Bool[Any, "*pairs point"]
+    believed: Bool[Any, "*pairs"]
+    scale: Float[Any, "*pairs"]
+
+
+class Sought(NamedTuple):
+    """What is known between the parts of a search: how many times it has begun, whether
+    it is to begin `again`, the points that it is to search among, what it has found,
+    and the factor of the standard deviations that this shows."""
+
+    number: Int[Any, "*pairs"]
+    again: Bool[Any, "*pairs"]
+    among: Bool[Any, "*pairs point"]
+    found: Found
+    scale: Float[Any, "*pairs"]
+
+
+class Witnesses(NamedTuple):
+    """What is to be said of the base of a pose: that a rotation explains all points but
+    some that agree by chance (`turned`), that such points carry it (`few`), or that the
+    other pose of a plane explains the others (`second`), which is asked of points that
+    are `flat`; the `chance` that a wrong point agrees."""
+
+    turned: Bool[Any, "*pairs"]
+    few: Bool[Any, "*pairs"]
+    flat: Bool[Any, "*pairs"]
+    second: Bool[Any, "*pairs"]
+    chance: Float[Any, "*pairs"]
+
+
+class Judgement(NamedTuple):
+    """What is known of a pair after some steps of a procedure: the decision, how many
+    points are `kept` and how many are `out` by it, whether their noise is `heavy`
+    (`fading`), what was `sought`, the witnesses of the base, and the `doubtful` points,
+    of which some are wrong, though nothing tells which."""
+
+    decision: Decision
+    kept: Float[Any, "*pairs"]
+    out: Float[Any, "*pairs"]
+    heavy: Bool[Any, "*pairs"]
+    sought: Sought
+    base: Witnesses
+    doubtful: Bool[Any, "*pairs point"]
+
+    def decided(self, pair: Pair, decision: Decision) -> "Judgement":
+        """The same with another decision about the pair, which has no unusable points
+        and the sigma that its points are judged by."""
+        pose, use = decision.pose, decision.use
+        return self._replace(
+            decision=decision,
+            kept=count(use),
+            out=count(pair.mask & ~use),
+            heavy=is_heavy(pair, pose, use),
+        )
+
+    def split(self) -> tuple["Judgement", tuple[Any, Any, Any]]:
+        """What is of the pair, and what is of its points."""
+        of_points = self.decision.use, self.sought.among, self.doubtful
+        return self.join((None, None, None)), of_points
+
+    def join(self, of_points: tuple[Any, Any, Any]) -> "Judgement":
+        """What `split` has taken apart."""
+        use, among, doubtful = of_points
+        return self._replace(
+            decision=self.decision._replace(use=use),
+            sought=self.sought._replace(among=among),
+            doubtful=doubtful,
+        )
+
+
+def nothing_known(focal: Float[Any, "*pairs"], mask: Bool[Any, "..."]) -> Judgement:
+    """The judgement before the first step, of pairs with these left focal lengths and
+    points; no two of its arrays are the same."""
+    zero, one, no = lambda: focal * 0, lambda: focal * 0 + 1, lambda: focal * 0 > 1
+    none, number = lambda: mask & False, lambda: (focal * 0).astype(int)
+
+    def pose() -> RelativePose:
+        numbers = one(), zero(), zero(), zero(), one(), zero(), zero()
+        return jax.tree.unflatten(_structure(), numbers)
+
+    found = Found(
+        pose=pose(),
+        cost=zero(),
+        blocks=number(),
+        counted=zero(),
+        enough=zero(),
+        agreed=zero(),
+        asked=zero(),
+    )
+    return Judgement(
+        decision=Decision(pose=pose(), use=none(), believed=no(), scale=one()),
+        kept=zero(),
+        out=zero(),
+        heavy=no(),
+        sought=Sought(number(), ~no(), ~none() & mask, found, one()),
+        base=Witnesses(turned=no(), few=no(), flat=no(), second=no(), chance=one()),
+        doubtful=none(),
+    )
+
+
+@lru_cache
+def _structure() -> Any:
+    """Of a pose, to be filled with arrays of NumPy or JAX."""
+    number = jax.ShapeDtypeStruct((), np.float64)
+    return jax.tree.structure(jax.eval_shape(vertical, number))
+
+
+class AbstractStep(eqx.Module):
+    """A step of a procedure, a program of its own: it judges the pairs that are open to
+    it. Most pairs are open to few steps."""
+
+    @abc.abstractmethod
+    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        """Whether pairs of which so much is known are open to it; in NumPy or JAX."""
+
+    @abc.abstractmethod
+    def judge(self, pair: Pair, known: Judgement) -> Judgement:
+        """What is known of an open pair after the step; works under jit and vmap."""
+
+
+def if_open(step: AbstractStep, pair: Pair, known: Judgement) -> Judgement:
+    """What is known of a pair after a step, if it is open to it; within a program."""
+
+    def judge(open_: Bool[Array, ""]) -> Judgement:
+        decision = known.decision._replace(use=known.decision.use & open_)
+        own = pair.with_mask(pair.mask & open_)
+        return step.judge(own, known._replace(decision=decision))
+
+    return if_needed(step.is_open(known), judge, known)

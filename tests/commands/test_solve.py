@@ -1,0 +1,74 @@
+"""What a command tells of a cleaned table is what the procedure found, pair by pair."""
+
+import numpy as np
+import pytest
+import scenes
+
+import jaxro
+from jaxro.batches.padding import plan_for
+from jaxro.commands.solve import Task, solve
+from jaxro.geometry.elements import RelativePose
+from jaxro.rejection import PROCEDURES
+from jaxro.reports.reader import report_elements
+
+POINTS = 50
+
+
+def with_long_tails(rng):
+    """A pair whose noise is not normal, so that its weights fade."""
+    left = rng.uniform([-900, -700], [900, 700], (POINTS, 2))
+    right = left - 2000 / rng.uniform(3, 6, (POINTS, 1)) * [1, 0]
+    sizes = np.where(rng.random((POINTS, 1)) < 0.1, 3.0, 0.3)
+    noise = sizes * rng.normal(size=(POINTS, 4))
+    return jaxro.pair(*(np.hstack([left, right]) + noise).T, focal=2000.0, sigma=1.2)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """Pairs of every kind, in an order in which none is beside one of its own."""
+    kinds = [scenes.weak_bases(kind, 2, POINTS, 0.3) for kind in ("plane", "space")]
+    kinds.append(scenes.weak_bases("rotation", 2, POINTS, 0.2))
+    of = lambda found, k: jaxro.pair(
+        *(c[k] for c in found.coordinates), focal=found.focal[k], sigma=found.sigma[k]
+    )
+    rng = np.random.default_rng(6)
+    return [
+        one
+        for k in range(2)
+        for one in (*(of(found, k) for found in kinds), with_long_tails(rng))
+    ]
+
+
+def test_a_table_tells_what_the_procedure_found(pairs):
+    """Its verdict, sigma0, elements and their deviations: planes with two poses,
+    rotations, and weights that fade."""
+    procedure = PROCEDURES["recommended"]
+    task = Task(RelativePose, ("elements",), sigma_known=True, procedure=procedure)
+    table = jaxro.join(pairs)
+    found = solve(table, task, plan_for(table.lengths))
+    results, faded = set(), False
+    for k, pair in enumerate(pairs):
+        alone = procedure(pair)
+        solved = alone.orientation
+        own = slice(*table.begins[k : k + 2])
+        assert found.outcome is not None and found.decided is not None
+        assert found.outcome[k] == alone.outcome._value
+        assert found.of_pairs["result"][k] == solved.result._value
+        np.testing.assert_array_equal(found.decided["kept"][own], alone.mask)
+        results.add(int(solved.result._value))
+        if not solved.usable:
+            continue
+        told = report_elements(solved.elements, solved.cofactor, solved.sigma0)
+        for name, value, deviation in zip(
+            ("bx", "by", "bz", "omega", "phi", "kappa"), *told, strict=True
+        ):
+            sd = found.of_pairs[f"sd_{name}"][k]
+            np.testing.assert_allclose(
+                found.of_pairs[name][k], value, atol=1e-8 * float(sd)
+            )
+            np.testing.assert_allclose(sd, deviation, rtol=1e-8)
+        np.testing.assert_allclose(found.of_pairs["sigma0"][k], solved.sigma0)
+        plain = jaxro.orient(pair.with_mask(alone.in_use), start=solved.pose)
+        faded |= bool(abs(plain.sigma0 / solved.sigma0 - 1) > 1e-3)
+    assert len(results) >= 3
+    assert faded
