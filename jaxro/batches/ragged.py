@@ -322,7 +322,7 @@ def _judge(
         of_pairs, of_points = out.tree
         padded = lambda rows: pairs._replace(mask=rows).pad_to(members, size).mask
         own = jax.tree.map(lambda a: a[members], of_pairs)
-        return own.join(tuple(map(padded, of_points)))
+        return own.join(jax.tree.map(padded, of_points))
 
     sizes = plan.sizes
     for step in procedure.steps():

@@ -85,6 +85,7 @@ class Rejection(eqx.Module):
     round that rejected it, or in the last round. `undecided`: points of which one is
     wrong, but the measurements do not tell which; they are kept. `orientation`: from
     the points `in_use`, those kept but for the undecided one that is most likely wrong.
+    `unchecked`: points rejected though they fit, as no other point checks them.
     """
 
     mask: Bool[Array, "*pairs point"]
@@ -95,13 +96,14 @@ class Rejection(eqx.Module):
     outcome: OUTCOMES
     undecided: Bool[Array, "*pairs point"]
     in_use: Bool[Array, "*pairs point"]
+    unchecked: Bool[Array, "*pairs point"]
 
     def first(self, points: int) -> "Rejection":
         """The same without the places behind so many points."""
         if points == self.mask.shape[-1]:
             return self
         of_points = lambda r: [
-            *(r.mask, r.order, r.statistic, r.undecided, r.in_use),
+            *(r.mask, r.order, r.statistic, r.undecided, r.in_use, r.unchecked),
             *(r.log.statistic, r.log.rejected, r.log.parallax),
         ]
         short = eqx.tree_at(of_points, self, first_points(of_points(self), points))

@@ -53,11 +53,21 @@ class Witnesses(NamedTuple):
     chance: Float[Any, "*pairs"]
 
 
+class OfPoints(NamedTuple):
+    """What a judgement holds of every point."""
+
+    use: Any
+    among: Any
+    unchecked: Any
+    doubtful: Any
+
+
 class Judgement(NamedTuple):
     """What is known of a pair after some steps of a procedure: the decision, how many
     points are `kept` and how many are `out` by it, whether their noise is `heavy`
-    (`fading`), what was `sought`, the witnesses of the base, and the `doubtful` points,
-    of which some are wrong, though nothing tells which."""
+    (`fading`), what was `sought`, the witnesses of the base, the points that are out as
+    they are `unchecked`, and the `doubtful` points, of which some are wrong, though
+    nothing tells which."""
 
     decision: Decision
     kept: Float[Any, "*pairs"]
@@ -65,6 +75,7 @@ class Judgement(NamedTuple):
     heavy: Bool[Any, "*pairs"]
     sought: Sought
     base: Witnesses
+    unchecked: Bool[Any, "*pairs point"]
     doubtful: Bool[Any, "*pairs point"]
 
     def decided(self, pair: Pair, decision: Decision) -> "Judgement":
@@ -78,18 +89,18 @@ class Judgement(NamedTuple):
             heavy=is_heavy(pair, pose, use),
         )
 
-    def split(self) -> tuple["Judgement", tuple[Any, Any, Any]]:
+    def split(self) -> tuple["Judgement", OfPoints]:
         """What is of the pair, and what is of its points."""
-        of_points = self.decision.use, self.sought.among, self.doubtful
-        return self.join((None, None, None)), of_points
+        own = self.decision.use, self.sought.among, self.unchecked, self.doubtful
+        return self.join(OfPoints(None, None, None, None)), OfPoints(*own)
 
-    def join(self, of_points: tuple[Any, Any, Any]) -> "Judgement":
+    def join(self, of_points: OfPoints) -> "Judgement":
         """What `split` has taken apart."""
-        use, among, doubtful = of_points
         return self._replace(
-            decision=self.decision._replace(use=use),
-            sought=self.sought._replace(among=among),
-            doubtful=doubtful,
+            decision=self.decision._replace(use=of_points.use),
+            sought=self.sought._replace(among=of_points.among),
+            unchecked=of_points.unchecked,
+            doubtful=of_points.doubtful,
         )
 
 
@@ -119,6 +130,7 @@ def nothing_known(focal: Float[Any, "*pairs"], mask: Bool[Any, "..."]) -> Judgem
         heavy=no(),
         sought=Sought(number(), ~no(), ~none() & mask, found, one()),
         base=Witnesses(turned=no(), few=no(), flat=no(), second=no(), chance=one()),
+        unchecked=none(),
         doubtful=none(),
     )
 

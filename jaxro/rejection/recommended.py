@@ -103,6 +103,8 @@ class Recommended(AbstractProcedure):
         limit = self._level.limit(pair)
         result = verdict_on(pair, solved, testable(pair, use), limit, w)
         result = result.only_if(believed, OUTCOMES.no_consensus)
+        fit = known.unchecked & (result.statistic <= limit)
+        result = dataclasses.replace(result, unchecked=fit)
         return result.take_back(known.doubtful)
 
     @property

@@ -161,6 +161,7 @@ def conclude(
         outcome=OUTCOMES.where(useless, OUTCOMES.not_oriented, outcome),
         undecided=doubtful,
         in_use=history.mask,
+        unchecked=history.mask & False,
     )
 
 

@@ -35,4 +35,5 @@ class TwoStage(AbstractProcedure):
             outcome=OUTCOMES.where(unfinished, one.outcome, two.outcome),
             undecided=two.undecided,
             in_use=two.in_use,
+            unchecked=one.unchecked | two.unchecked,
         )

@@ -72,15 +72,18 @@ class IsChecked(AbstractStep):
         """With the decision that only such points are in use."""
         pose, use, _, scale = known.decision
         pair, limit = self.level.judged_by(pair, scale), self.level.limit(pair)
-        pose, use = without_unchecked(pair, pose, use, limit, known.base.chance)
-        return known.decided(pair, known.decision._replace(pose=pose, use=use))
+        found = without_unchecked(pair, pose, use, limit, known.base.chance)
+        decision = known.decision._replace(pose=found.pose, use=found.use)
+        return known.decided(pair, decision)._replace(unchecked=found.unchecked)
 
 
 class Checked(NamedTuple):
-    """A pose, and the points in use that the others check."""
+    """A pose, the points in use that the others check, and those that were in use,
+    which they do not."""
 
     pose: RelativePose
     use: Use
+    unchecked: Use
 
 
 def without_unchecked(
@@ -90,8 +93,8 @@ def without_unchecked(
     limit: Float[Array, ""],
     chance: Float[Array, ""],
 ) -> Checked:
-    """The pose of the points in use that the others check, and these points, judged
-    anew by |w| <= limit.
+    """The pose of the points in use that the others check, these points, judged anew by
+    |w| <= limit, and the others.
 
     `chance`: that of a wrong point to agree with the pose. The pose without a wrong
     point may suit another one, so that it is done again until all are checked.
@@ -99,19 +102,19 @@ def without_unchecked(
     most = count(use) / PART
 
     def turn(state):
-        k, _, (pose, use), doubted = state
+        k, _, before = state
+        pose, use, doubted = before
         doubtful = find_unchecked(pair, pose, use, chance)
         some = (count(doubtful) > 0) & (count(doubted | doubtful) <= most)
         doubted = doubted | (doubtful & some)
         own = pair.with_mask(pair.mask & ~doubted & some)
-        new = keep_agreeing(own, pose, use & own.mask, limit, ROUNDS)
-        new = Checked(new[0], new[1] & seen(own, new[0], limit))
-        return k + 1, some, choose(some, new, Checked(pose, use)), doubted
+        pose, use = keep_agreeing(own, pose, use & own.mask, limit, ROUNDS)
+        new = Checked(pose, use & seen(own, pose, limit), doubted)
+        return k + 1, some, choose(some, new, before)
 
-    start = jnp.zeros((), int), most >= 1, Checked(pose, use), use & False
+    start = jnp.zeros((), int), most >= 1, Checked(pose, use, use & False)
     more = lambda state: state[1] & (state[0] < TURNS)
-    *_, found, _ = while_loop(more, turn, start, pair.focal_left)
-    return found
+    return while_loop(more, turn, start, pair.focal_left)[-1]
 
 
 def find_unchecked(

@@ -79,7 +79,7 @@ def _show_rejections(
     )
     console.print(rows)
     left_out(console, len(rejected), "rejections")
-    unchecked = rejected[verdicts.fits[rejected]]
+    unchecked = rejected[verdicts.of_points["unchecked"][rejected]]
     if unchecked.size:
         points = verdicts.table.points[unchecked]
         owners = verdicts.table.names[owner[unchecked]]

@@ -8,11 +8,13 @@ decisions.csv, decisions.json.
 * decisions.csv: every point in use in every round. Without a limit the round was an
   iteration and no decision.
 * decisions.json: the procedure with its tolerances; of each pair the outcome, the
-  points in the order of rejection (those of one list went together), the undecided
-  points and the elements by round.
+  points in the order of rejection (those of one list went together), those of them
+  that fit but that no other point checks, the undecided points and the elements by
+  round.
 
 What a statistic is, and its unit, says the procedure; inf: wrong by any measure. A
-rejected point with a statistic below its limit fits, but no other point checks it.
+point that `recommended` rejected with a statistic below its limit fits, but no other
+point checks it.
 """
 
 from collections.abc import Sequence
@@ -43,6 +45,7 @@ class Decision(NamedTuple):
     limit: Float[Either, "point"]
     undecided: Bool[Either, "point"]
     in_use: Bool[Either, "point"]
+    unchecked: Bool[Either, "point"]
     outcome: Int[Either, ""]
 
 
@@ -63,6 +66,7 @@ def decision(found: Rejection) -> Decision:
         limit=limit,
         undecided=found.undecided,
         in_use=found.in_use,
+        unchecked=found.unchecked,
         outcome=found.outcome._value,
     )
 
@@ -152,12 +156,6 @@ class Verdicts:
         return out[np.lexsort((order, self.table.owners[out]))]
 
     @cached_property
-    def fits(self) -> Bool[np.ndarray, " row"]:
-        """The rows whose statistic is below the limit of a test."""
-        statistic, limit = self.of_points["statistic"], self.of_points["limit"]
-        return (statistic < limit) & np.isfinite(limit)
-
-    @cached_property
     def undecided(self) -> dict[int, list[str]]:
         """By the number of the pair the points of which one is wrong, none rejected."""
         named: dict[int, list[str]] = {}
@@ -204,6 +202,11 @@ def summary_of(verdicts: Verdicts, summary: dict[str, Any]) -> dict[str, Any]:
     return {**summary, "pairs": [_summary(verdicts, k) for k in number]}
 
 
+def _names(table: Table, rows: Int[np.ndarray, " some"]) -> list[str]:
+    """The points of these rows."""
+    return list(map(str, table.points[rows]))
+
+
 def _summary(verdicts: Verdicts, number: int) -> dict[str, Any]:
     """What decisions.json says of a pair."""
     table = verdicts.table
@@ -223,6 +226,7 @@ def _summary(verdicts: Verdicts, number: int) -> dict[str, Any]:
         "points": int(table.lengths[number]),
         "rejected": len(rejected),
         "order": list(together.values()),
+        "unchecked": _names(table, rejected[verdicts.of_points["unchecked"][rejected]]),
         "undecided": verdicts.undecided.get(number, []),
         "elements": [
             {"round": k, **dict(zip(names, np.rad2deg(values).tolist(), strict=True))}
