@@ -242,17 +242,16 @@ def clean_in_stages(
             known = judge_slabs(pairs, known, step, split, report, settings)
         elif open_.size:
             some = _rows((pairs, known), open_)
-            own = _few_shapes(step, some[0], split)
+            own = _few_shapes(some[0], _split_of(step, some[0], split)[0])
             new = judge_slabs(*some, step, own, silent, settings)
             known = _replace_rows(known, open_, new)
         report = silent
     return conclude_slabs(pairs, known, procedure, read, split)
 
 
-def _few_shapes(step: AbstractStep, pairs: Pair, split: Split) -> Split:
-    """How the pairs that are open to a step are split: whatever number of pairs that
-    is, calls have one of few shapes, 4, 16, 64, ... pairs."""
-    split, _ = _split_of(step, pairs, split)
+def _few_shapes(pairs: Pair, split: Split) -> Split:
+    """How some pairs of a batch are split: whatever number of pairs that is, calls have
+    one of few shapes, 4, 16, 64, ... pairs."""
     if split.slab is not None or not has_caches():
         return split
     total, points = pairs.x_left.shape
@@ -304,9 +303,10 @@ def conclude_slabs(
         """What the program tells of these pairs."""
         program = slab.using(settings)
         program = program.bind(procedure=procedure, read=read, chunk=chunk)
-        every = rows.size == len(pairs.focal_left)
-        some = (pairs, known) if every else _rows((pairs, known), rows)
-        return spread(some, program, split, chunk)
+        if rows.size == len(pairs.focal_left):
+            return spread((pairs, known), program, split, chunk)
+        some = _rows((pairs, known), rows)
+        return spread(some, program, _few_shapes(some[0], split), chunk)
 
     usual = procedure.is_usual(known)
     first, rest = np.flatnonzero(usual), np.flatnonzero(~usual)

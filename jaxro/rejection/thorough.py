@@ -264,14 +264,18 @@ class Thorough(AbstractStage):
         return best(poses, costs)
 
 
-class Seeks(AbstractStep):
-    """The search of `Thorough`."""
+class AbstractSearching(AbstractStep):
+    """A part of `Thorough`, which goes on until it is not to begin again."""
 
     stage: Thorough
     level: Level
 
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
         return ~known.decision.believed & known.sought.again
+
+
+class Seeks(AbstractSearching):
+    """The search of `Thorough`."""
 
     def judge(self, pair: Pair, known: Judgement) -> Judgement:
         """With what is found."""
@@ -279,14 +283,8 @@ class Seeks(AbstractStep):
         return known._replace(sought=self.stage.seek(own, known.sought, limit))
 
 
-class Settles(AbstractStep):
+class Settles(AbstractSearching):
     """What becomes of the search of `Thorough`."""
-
-    stage: Thorough
-    level: Level
-
-    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
-        return ~known.decision.believed & known.sought.again
 
     def judge(self, pair: Pair, known: Judgement) -> Judgement:
         """With the decision, and whether the search is to begin again."""
