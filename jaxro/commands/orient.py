@@ -16,7 +16,7 @@ from ..rejection import AbstractProcedure
 from ..reports import files, pair as report, reliability
 from ..reports.columns import TABLES, Units
 from ..reports.html.pairs import Cleaned, page_of_pairs
-from ..reports.model import Results, find_patterns, find_rotations
+from ..reports.model import Results, find_intervals, find_patterns, find_rotations
 from ..reports.terminal import consoles, progress, say_what
 from ..reports.verdicts import Verdicts
 from ..tables import csv as tables, whole
@@ -166,6 +166,15 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
         confidence=job.options.confidence,
         patterns=find_patterns(used, found.of_pairs) if rigorous else {},
         rotations=find_rotations(used, found.of_pairs),
+        intervals=find_intervals(
+            used,
+            found.of_pairs,
+            job.task.system,
+            job.task.sigma_known,
+            job.options.confidence,
+        )
+        if rigorous
+        else {},
     )
     return results, verdicts
 

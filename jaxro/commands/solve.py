@@ -76,7 +76,7 @@ class Task:
         wanted = self.tables
         if "reliability" in wanted and "points" not in wanted:
             wanted = (*wanted, "points")
-        return Reader(self.system, wanted, self.procedure is not None)
+        return Reader(self.system, wanted, self.sigma_known, self.procedure is not None)
 
     @property
     def cleaned_reader(self) -> "CleanedReader":

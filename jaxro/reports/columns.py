@@ -169,6 +169,7 @@ BEFORE_ELEMENTS = (
 BEHIND_ELEMENTS = (
     Column("m_q", Kind.PHOTO, of=_orientation("m_q"), there="usable"),
     Column("sigma0", Kind.SIGMA0, of=_orientation("sigma0"), there="usable"),
+    Column("curvature", of=lambda told: told.curvature, there="usable"),
     Column(
         "advice",
         source="result",

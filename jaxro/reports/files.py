@@ -126,6 +126,7 @@ def _pair(one: One) -> dict[str, Any]:
         "iterations": one.value("iterations"),
         "m_q": one.value("m_q"),
         "sigma0": one.value("sigma0"),
+        "curvature": one.value("curvature"),
         "elements": {e.name: _element(e) for e in one.elements},
         "correlations": one.correlations,
         "rotation": _rotation(one.rotation),
@@ -159,7 +160,11 @@ def _camera(camera: Camera) -> dict[str, Any]:
 
 def _element(e: Element) -> dict[str, Any]:
     value = {"unit": e.unit or None, "value": e.value, "sd": e.deviation}
-    return value if e.half_width is None else value | {"half_width": e.half_width}
+    if e.half_width is not None:
+        value |= {"half_width": e.half_width}
+    if e.by_likelihood is not None:
+        value |= {"by_likelihood": list(e.by_likelihood)}
+    return value
 
 
 def json_text(value: Any) -> str:

@@ -12,11 +12,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment import critical_values
-from ..assessment import Pattern, neighbours
+from ..assessment import Pattern, likelihood, neighbours
 from ..batches.buckets import choose
 from ..batches.padding import sizes
 from ..batches.ragged import Ragged
-from ..geometry.elements import AbstractElements, RelativePose
+from ..geometry.elements import (
+    AbstractElements,
+    DependentElements,
+    RelativePose,
+    convert,
+)
 from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Camera, Coordinates, Pair, mask_unusable
 from ..orientation.pure_rotation import PureRotation, orient_rotation
@@ -31,9 +36,11 @@ from .columns import (
     Units,
     columns_of,
     element_columns,
+    element_names,
     is_given,
     is_usable,
 )
+from .reader import report_numbers
 
 MOST_POINTS = 200
 """Points of a pair whose residuals are looked at together: of more, every second,
@@ -47,21 +54,23 @@ third, ... one."""
 @dataclass(frozen=True)
 class Element:
     """One reported number of an orientation. `deviation` is None for what is given, not
-    adjusted; `half_width` of its interval is None where none was asked for."""
+    adjusted; `half_width` of its interval is None where none was asked for, and
+    `by_likelihood`, the ends of that interval, where the deviation says it all."""
 
     name: str
     unit: str
     value: float
     deviation: float | None
     half_width: float | None = None
+    by_likelihood: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
 class Results:
     """Oriented pairs: the columns of the pairs and, by table, of the points that
-    `table` holds, those kept. `confidence`: of the intervals that are asked for;
-    `patterns`, and `rotations` of pairs without a base: by the numbers of the
-    pairs."""
+    `table` holds, those kept. `confidence`: of the intervals that are asked for. By the
+    numbers of the pairs: `patterns`, `rotations` of pairs without a base, `intervals`
+    by likelihood of pairs whose deviations do not say it all."""
 
     table: Table
     cameras: CameraPairs
@@ -73,6 +82,7 @@ class Results:
     confidence: float | None = None
     patterns: dict[int, Pattern] = field(default_factory=dict)
     rotations: dict[int, PureRotation] = field(default_factory=dict)
+    intervals: dict[int, likelihood.Interval] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.table.names)
@@ -190,6 +200,7 @@ class One:
     def elements(self) -> list[Element]:
         """The elements that are reported, NaN where they are not usable."""
         system, widths = self.results.system, self.results.half_widths
+        names, ends = element_names(system), self.results.intervals.get(self.number)
         found = []
         for column in element_columns(system):
             name = column.name
@@ -197,6 +208,10 @@ class One:
                 continue
             given = is_given(name, system)
             width = None if given or name not in widths else widths[name]
+            between = None
+            if ends is not None and not given:
+                place = names.index(name)
+                between = ends.least[place].item(), ends.most[place].item()
             found.append(
                 Element(
                     name=name,
@@ -204,6 +219,7 @@ class One:
                     value=self.value(name),
                     deviation=None if given else self.value(f"sd_{name}"),
                     half_width=None if width is None else width[self.number].item(),
+                    by_likelihood=between,
                 )
             )
         return found
@@ -240,6 +256,62 @@ def find_rotations(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, PureRot
         return orient_rotation(jax.tree.map(lambda a: a[0], padded))
 
     return {int(number): find(number) for number in chosen}
+
+
+USUAL = 0.95
+"""The confidence of intervals by likelihood where none was asked for."""
+
+SAME_SQUARES = 1e-6
+"""Relative difference of Σ r² from sigma0² (n - 5) that is not rounding: the elements
+are then not those of least squares."""
+
+
+def find_intervals(
+    pairs: Ragged,
+    of_pairs: dict[str, Any],
+    system: type[AbstractElements],
+    sigma_known: bool,
+    confidence: float | None = None,
+) -> dict[int, likelihood.Interval]:
+    """The intervals by likelihood of the reported numbers of pairs with a large
+    curvature, by the numbers of the pairs; of the first MOST_PAIRS. Weights that have
+    faded leave no sum of squares to tell them by: such pairs have none."""
+    curved = is_usable(of_pairs["result"]) & (of_pairs["curvature"] > likelihood.CURVED)
+    chosen = np.flatnonzero(curved)[:MOST_PAIRS]
+    confidence = USUAL if confidence is None else confidence
+    found = {}
+    for number in chosen.tolist():
+        batch = pairs.pad_to(np.array([number]), sizes(pairs.lengths[[number]], 1)[0])
+        pair = jax.tree.map(lambda a: a[0], batch)
+        of_pair = lambda name, number=number: of_pairs[name][number]
+        sigma0, freedom = of_pair("sigma0"), of_pair("degrees_of_freedom")
+        known = critical_values.normal(1 - confidence)
+        own = critical_values.half_width(confidence, freedom) * sigma0
+        limit = float(known if sigma_known else own) ** 2
+        base = of_pair("bx") if system is DependentElements else 1.0
+        squares, interval = _find_interval(
+            pair, of_pair("pose"), base, limit, system=system
+        )
+        expected = sigma0**2 * freedom
+        if freedom == 0 or abs(squares - expected) <= SAME_SQUARES * expected:
+            found[number] = jax.tree.map(np.asarray, interval)
+    return found
+
+
+@compiled
+def _find_interval(
+    pair: Pair,
+    pose: Float[Array, "7"],
+    base: Float[Array, ""],
+    limit: Float[Array, ""],
+    *,
+    system: type[AbstractElements],
+) -> tuple[Float[Array, ""], likelihood.Interval]:
+    """Σ r² at a pose, and the ends of the numbers that are reported of it in a system
+    with this given length of the base."""
+    elements = convert(RelativePose(*pose), system, base)
+    ends = likelihood.ends(pair, elements, limit, quantity=report_numbers)
+    return likelihood.misfit(pair, elements), ends
 
 
 def find_patterns(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, Pattern]:

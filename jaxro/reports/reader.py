@@ -2,6 +2,7 @@
 of a pair and its orientation. Angles become degrees.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment.guarded import root
+from ..assessment.likelihood import curvature
 from ..assessment.reliability import Reliability, assess, controllability
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import (
@@ -30,18 +32,25 @@ class Reader(NamedTuple):
     """read(pair, orientation) -> columns of the pair, {table: columns of its points}:
     all `tables` but reliability, for which there is an `Assessor`.
 
+    `sigma_known`: whether the sigmas of the pairs are true standard deviations;
     `all_parallaxes`: whether y-parallaxes of points that take no part are wanted.
     """
 
     system: type[AbstractElements]
     tables: tuple[str, ...]
+    sigma_known: bool = False
     all_parallaxes: bool = False
 
     def __call__(
         self, pair: Pair, orientation: Orientation
     ) -> tuple[Columns, dict[str, Columns]]:
         """The columns by name."""
-        told = Told(pair, orientation, all_parallaxes=self.all_parallaxes)
+        told = Told(
+            pair,
+            orientation,
+            sigma_known=self.sigma_known,
+            all_parallaxes=self.all_parallaxes,
+        )
         read = lambda table: _read(table, told)
         of_points = [t for t in self.tables if t not in ("elements", "reliability")]
         return read("elements"), {table: read(table) for table in of_points}
@@ -108,38 +117,45 @@ def _read(table: str, told: "Told") -> Columns:
 def report_elements(
     found: AbstractElements, cofactor: Array, sigma0: Array
 ) -> tuple[list[Array], list[Array]]:
-    """The numbers that are reported of elements and their standard deviations: angles
-    in degrees.
-
-    Of a `RelativePose`: the unit base vector and the angles of M = R3(kappa) R2(phi)
-    R1(omega), with sqrt(diag(J C Jᵀ)). Of `DependentElements` bx first, which is given:
-    deviation 0.
-    """
-    degrees = lambda numbers, angles: [
-        jnp.rad2deg(n) if angle else n for n, angle in zip(numbers, angles, strict=True)
-    ]
+    """The numbers that are reported of elements and their standard deviations,
+    sqrt(diag(J C Jᵀ)): angles in degrees. What is given has the deviation 0."""
+    numbers, angles = _numbers(found)
     if not isinstance(found, RelativePose):
-        bx = [found.bx] if isinstance(found, DependentElements) else []
-        angles, zero = (
-            (False,) * len(bx) + found.angles,
-            [jnp.zeros_like(sigma0)] * len(bx),
-        )
-        deviations = [sigma0 * root(cofactor[i, i]) for i in range(5)]
-        return degrees([*bx, *found.values()], angles), degrees(
-            [*zero, *deviations], angles
-        )
+        zero = [jnp.zeros_like(sigma0)] * (len(numbers) - 5)
+        deviations = [*zero, *(sigma0 * root(cofactor[i, i]) for i in range(5))]
+        return _in_degrees(numbers, angles), _in_degrees(deviations, angles)
 
-    def values(*step: Array) -> tuple[Array, ...]:
-        rotation, base = found.move(step).relative()
-        return (*base, *rot.omega_phi_kappa(rot.transpose(rotation)))
-
-    zero = (jnp.zeros_like(sigma0),) * 5
-    slopes = jax.jacfwd(values, argnums=tuple(range(5)))(*zero)
+    values = lambda *step: _numbers(found.move(step))[0]
+    origin = (jnp.zeros_like(sigma0),) * 5
+    slopes = jax.jacfwd(values, argnums=tuple(range(5)))(*origin)
     jacobian = jnp.stack([jnp.stack(row) for row in slopes])
     products = jacobian[:, :, None] * jacobian[:, None, :] * cofactor[None]
     deviations = sigma0 * root(jnp.sum(products, axis=(1, 2)))
-    angles = (False,) * 3 + (True,) * 3
-    return degrees(values(*zero), angles), degrees(list(deviations), angles)
+    return _in_degrees(values(*origin), angles), _in_degrees(list(deviations), angles)
+
+
+def report_numbers(centre: AbstractElements, elements: AbstractElements) -> Array:
+    """The numbers that are reported of elements, in degrees where they are angles, as a
+    `likelihood.Quantity`."""
+    del centre
+    return jnp.stack(_in_degrees(*_numbers(elements)))
+
+
+def _numbers(elements: AbstractElements) -> tuple[list[Array], tuple[bool, ...]]:
+    """The numbers that are reported, and which of them are angles: of a `RelativePose`
+    the base and the angles of M = R3(kappa) R2(phi) R1(omega), of `DependentElements`
+    bx first."""
+    if isinstance(elements, RelativePose):
+        rotation, base = elements.relative()
+        angles = rot.omega_phi_kappa(rot.transpose(rotation))
+        return [*base, *angles], (False,) * 3 + (True,) * 3
+    bx = [elements.bx] if isinstance(elements, DependentElements) else []
+    return [*bx, *elements.values()], (False,) * len(bx) + elements.angles
+
+
+def _in_degrees(numbers: Sequence[Array], angles: Sequence[bool]) -> list[Array]:
+    both = zip(numbers, angles, strict=True)
+    return [jnp.rad2deg(n) if angle else n for n, angle in both]
 
 
 class Told:
@@ -178,12 +194,21 @@ class Told:
         o = self.orientation
         return report_elements(o.elements, o.cofactor, o.sigma0)
 
+    @property
+    def _known(self) -> Array | None:
+        """sigma0 where it is known before the measurement."""
+        sigma0 = self.orientation.sigma0
+        return jnp.ones_like(sigma0) if self._sigma_known else None
+
+    @cached_property
+    def curvature(self) -> Array:
+        """How far the deviations of the elements are from being all there is to say."""
+        return curvature(self.pair, self.orientation, sigma0=self._known)
+
     @cached_property
     def reliability(self) -> Reliability:
         """What the measurements tell of errors in each other."""
-        o = self.orientation
-        sigma0 = jnp.ones_like(o.sigma0) if self._sigma_known else None
-        return assess(self.pair, o, sigma0=sigma0)
+        return assess(self.pair, self.orientation, sigma0=self._known)
 
     @cached_property
     def control(self) -> tuple[Array, ...]:

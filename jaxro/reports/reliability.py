@@ -8,9 +8,10 @@ from rich.markup import escape
 
 from ..adjustment import critical_values
 from ..assessment import Pattern
+from ..assessment.likelihood import CURVED
 from ..assessment.reliability import BOUNDS
 from .columns import Units
-from .model import One, Results
+from .model import USUAL, Element, One, Results
 from .pair import digits, join_names, table, unit_name
 from .rows import left_out, worst
 from .text import number
@@ -93,7 +94,7 @@ def sentences(one: One) -> list[str]:
         )
     said += doubts(one)
     said += pattern_sentences(one.pattern, one.results.units)
-    return said + _weak_points(one, points)
+    return said + _bent_deviations(one) + _weak_points(one, points)
 
 
 def doubts(one: One) -> list[str]:
@@ -180,6 +181,32 @@ def pattern_sentences(pattern: Pattern | None, units: Units, of: str = "") -> li
         f"{number(length, digits(length, 0))} {units.photo} (probability "
         f"{chance:.1g}): they are too small."
     ]
+
+
+def _bent_deviations(one: One) -> list[str]:
+    """Where deviations do not say it all, what the measurements themselves say."""
+    curvature = one.value("curvature")
+    if not curvature > CURVED:
+        return []
+    said = (
+        "The misfit bends within the deviations, which then hold less often than they "
+        f"say (curvature {number(curvature, 1)}, above {CURVED})."
+    )
+    told = [e for e in one.elements if e.by_likelihood is not None]
+    if not told:
+        return [said]
+    confidence = one.results.confidence or USUAL
+    between = ", ".join(_between(e) for e in told)
+    return [f"{said} By likelihood {100 * confidence:g} % hold {between}."]
+
+
+def _between(e: Element) -> str:
+    """The interval by likelihood of an element."""
+    decimals, ends = digits(e.deviation), e.by_likelihood or ()
+    least, most = (
+        number(end, decimals) if np.isfinite(end) else "no end" for end in ends
+    )
+    return f"{e.name} {least} to {most} {unit_name(e.unit)}".rstrip()
 
 
 def _doubt_sigma(one: One) -> list[str]:

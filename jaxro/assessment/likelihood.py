@@ -1,0 +1,217 @@
+"""Regions and intervals by likelihood, for pairs whose normal equations change within
+their own accuracy.
+
+The covariance describes the misfit S(x) = Σ r² near its minimum x0 by a parabola. With
+a short base, or hardly more than five points, S bends away from it before the elements
+have moved by their standard deviations, and "value ± deviation" holds less often than
+it says. The measurements themselves tell the region that no choice of elements changes:
+all x with
+
+    S(x) - S(x0) <= s² χ²(5),    or    s² 5 F(5, n - 5)    where s is estimated,
+
+the likelihood ratio of x against x0 (Wilks 1938). The interval of one number h(x)
+reaches from its least to its largest value where S is above its minimum by at most s²
+times the square of the normal quantile, or of Student's t (Venzon and Moolgavkar 1988).
+
+For orientations with rigorous residuals and without a loss.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, ScalarLike
+
+from ..adjustment import critical_values, normal_equations as normal
+from ..geometry import coplanarity
+from ..geometry.elements import AbstractElements
+from ..geometry.pairs import Pair, mask_unusable
+from ..orientation.degeneracy import direction_of_worst
+from ..orientation.result import Orientation
+from ..xla.passes import total
+from ..xla.programs import compiled
+from .sensitivity import displacement
+
+Number = Float[Array, ""]
+Numbers = Float[Array, "number"]
+Quantity = Callable[[AbstractElements, AbstractElements], Numbers]
+"""Numbers h(centre, elements) of any elements, beside those of the orientation."""
+
+CURVED = 0.3
+"""The `curvature` from which deviations are told to be too simple: 95 % regions by the
+covariance hold 92 to 95 % below .1, and 55 to 84 % above 1."""
+
+MOST_STEPS = 200
+"""Towards an end of an interval; from 4 to 20 where S sets it."""
+
+CLOSE = 1e-9
+"""Gain of a step, over the width of the interval, below which its end is reached."""
+
+LONGEST, SHORTER = 2.0, 0.25
+"""Of a step, in widths of the region by the covariance; and by what the next one is
+shorter where one gains nothing."""
+
+
+def misfit(pair: Pair, elements: AbstractElements) -> Number:
+    """S, the sum of the squared whitened residuals of one pair at any elements."""
+    return total(coplanarity.residuals(mask_unusable(pair)[0], elements)() ** 2)
+
+
+@compiled
+def curvature(
+    pair: Pair, orientation: Orientation, *, sigma0: ArrayLike | None = None
+) -> Number:
+    """How far S departs from its parabola two standard deviations along the worst
+    determined direction: |rise of S / (4 s²) - 1|, on the side where that is more.
+
+    Zero for a linear adjustment; from `CURVED` on `interval` tells what deviations do
+    not. `sigma0`: the standard deviation of unit weight where it is known (1 where the
+    sigmas of the pair are standard deviations), or else that of the orientation. Of one
+    pair; works under jit and vmap.
+    """
+    pair, centre = mask_unusable(pair)[0], orientation.elements
+    residuals = coplanarity.residuals(pair, centre)
+    direction, _ = direction_of_worst(centre, orientation.cofactor)
+    along = lambda t: residuals(tuple(t * e for e in direction))
+    zero = jnp.zeros_like(orientation.sigma0)
+    r, slope = jax.jvp(along, (zero,), (jnp.ones_like(zero),))
+    unit = _unit(orientation, sigma0)
+    twice = 2 * unit / jnp.sqrt(total(slope**2))
+    # but for its slope, which is zero in the minimum of S: weights that fade have another
+    rises = [total(along(t) ** 2 - r**2 - 2 * t * r * slope) for t in (twice, -twice)]
+    return jnp.maximum(*(jnp.abs(rise / (4 * unit**2) - 1) for rise in rises))
+
+
+def region_holds(
+    pair: Pair,
+    orientation: Orientation,
+    elements: AbstractElements,
+    confidence: ScalarLike = 0.95,
+    *,
+    sigma0: ArrayLike | None = None,
+) -> Bool[Array, ""]:
+    """Whether the joint region of an oriented pair holds these elements, of any system;
+    without redundancy and a known sigma0 it holds all."""
+    rise = misfit(pair, elements) - misfit(pair, orientation.elements)
+    limit = orientation.radius(confidence, sigma0=sigma0) ** 2
+    return ~(rise > limit * _unit(orientation, sigma0) ** 2)
+
+
+class Interval(NamedTuple):
+    """From `least` to `most`, for each number; infinite where the measurements set no
+    end, or none is found."""
+
+    least: Numbers
+    most: Numbers
+
+
+def interval(
+    pair: Pair,
+    orientation: Orientation,
+    confidence: ScalarLike = 0.95,
+    *,
+    quantity: Quantity = displacement,
+    sigma0: ArrayLike | None = None,
+) -> Interval:
+    """The intervals by likelihood of numbers of the elements of one oriented pair.
+
+    `quantity`: h(centre, elements), with `centre` those of the orientation; if not
+    given how far the five (local) elements are from it. `sigma0` as in `curvature`.
+    """
+    if sigma0 is None:
+        freedom = jnp.asarray(orientation.degrees_of_freedom, float)
+        width = critical_values.half_width(confidence, freedom)
+    else:
+        width = critical_values.normal(1 - confidence)
+    limit = (width * _unit(orientation, sigma0)) ** 2
+    return ends(pair, orientation.elements, limit, quantity=quantity)
+
+
+def _unit(orientation: Orientation, sigma0: ArrayLike | None) -> Number:
+    """The standard deviation of unit weight, as given or of the orientation."""
+    own = orientation.sigma0
+    return own if sigma0 is None else jnp.asarray(sigma0, own.dtype)
+
+
+class _Way(NamedTuple):
+    """A place on the way to an end of an interval, the value there, and its `merit`:
+    the value, less what S is above the limit; `longest`: the step that may follow, in
+    widths of the region by the covariance; `arrived`; `left`: steps that may follow."""
+
+    x: Float[Array, "5"]
+    value: Number
+    merit: Number
+    longest: Number
+    arrived: Bool[Array, ""]
+    left: Int[Array, ""]
+
+
+@compiled
+def ends(
+    pair: Pair, centre: AbstractElements, limit: Number, *, quantity: Quantity
+) -> Interval:
+    """The least and the largest values of numbers of the elements where S is above its
+    minimum, in `centre`, by the limit.
+
+    At x, with the residuals r, their columns A, N = AᵀA and the slope a of h, S changes
+    by 2 gᵀd + dᵀNd with g = Aᵀr. The end of h among the d that leave S below its
+    minimum plus the limit is d = -N⁻¹g ± λ N⁻¹a with λ² aᵀN⁻¹a = what is left of the
+    limit in the lowest point of this parabola. The step to it is repeated there; one
+    that makes nothing better is taken back, and the next is shorter: h may have its end
+    within the region, as the longest component of a base does.
+    """
+    residuals = coplanarity.residuals(mask_unusable(pair)[0], centre)
+    lowest = total(residuals() ** 2)
+    white = lambda x: residuals(tuple(x))
+    number = lambda x: quantity(centre, centre.move(x).normalise())
+
+    def end(which: Int[Array, ""], sign: Number) -> Number:
+        value_of = lambda x: number(x)[which]
+
+        def step(x: Array) -> tuple[Array, Number, Number]:
+            """The step from x, its length, and the standard deviation of h there for
+            sigma0 = 1."""
+            columns = jax.jacfwd(white)(x)
+            n, g, squares = normal.accumulate([white(x)], [[c] for c in columns.T])
+            q, g = normal.dense(normal.inverse(n)[0]), jnp.stack(list(g))
+            slope = jax.grad(value_of)(x)
+            along, down = q @ slope, q @ g
+            left = limit - (squares - lowest) + g @ down
+            reach = jnp.sqrt(jnp.maximum(left, 0.0) / (slope @ along))
+            step = sign * reach * along - down
+            return step, jnp.sqrt(step @ normal.dense(n) @ step), slope @ along
+
+        def at(x: Array) -> tuple[Number, Number]:
+            """The value there, and its merit over the width of the interval."""
+            value, rise = value_of(x), total(white(x) ** 2) - lowest
+            above = jnp.maximum(rise / limit - 1, 0.0)
+            return value, sign * (value - value_of(origin)) / width - above
+
+        def further(way: _Way) -> _Way:
+            direction, length, _ = step(way.x)
+            part = jnp.minimum(1.0, way.longest * jnp.sqrt(limit) / length)
+            x = way.x + part * direction
+            value, merit = at(x)
+            gain = merit - way.merit
+            small = jnp.abs(gain) < CLOSE
+            longest = jnp.minimum(way.longest / SHORTER, LONGEST)
+            moved = _Way(x, value, merit, longest, small, way.left - 1)
+            stay = way._replace(
+                longest=jnp.minimum(way.longest, length / jnp.sqrt(limit)) * SHORTER,
+                arrived=small,
+                left=way.left - 1,
+            )
+            return jax.tree.map(lambda a, b: jnp.where(gain > 0, a, b), moved, stay)
+
+        origin = jnp.zeros(centre.count)
+        width = jnp.sqrt(limit * step(origin)[2])
+        longest, left = jnp.asarray(LONGEST), jnp.asarray(MOST_STEPS)
+        start = _Way(origin, *at(origin), longest, jnp.asarray(False), left)
+        goes_on = lambda way: ~way.arrived & (way.left > 0)
+        last = jax.lax.while_loop(goes_on, further, start)
+        return jnp.where(last.arrived, last.value, sign * jnp.inf)
+
+    numbers = jnp.arange(jax.eval_shape(number, jnp.zeros(centre.count)).size)
+    ends = jax.vmap(end, in_axes=(0, None))
+    return Interval(ends(numbers, jnp.asarray(-1.0)), ends(numbers, jnp.asarray(1.0)))
