@@ -36,12 +36,16 @@ from .assessment import (
     familywise as familywise,
     identification as identification,
     layout_design as layout_design,
+    likelihood as likelihood,
     reliability as reliability,
     sensitivity as sensitivity,
     variance_components as variance_components,
 )
 from .assessment.reliability import Reliability as Reliability, assess as assess
-from .batches import table_noise as table_noise
+from .batches import (
+    table_neighbours as table_neighbours,
+    table_noise as table_noise,
+)
 from .batches.after_cleaning import (
     AfterCleaning as AfterCleaning,
     after_cleaning as after_cleaning,

@@ -192,7 +192,7 @@ def inverse(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
         full, pivots = symmetric.inverse(dense(n))
         return [[full[i, j] for j in range(i + 1)] for i in range(p)], jnp.min(pivots)
     factor, pivot = cholesky(n)
-    lower = _inverse_of_lower(factor)
+    lower = inverse_of_lower(factor)
 
     def entry(i: int, j: int) -> Any:
         """Of L⁻ᵀ L⁻¹, i >= j."""
@@ -202,7 +202,7 @@ def inverse(n: Lower) -> tuple[Lower, Float[Array, "..."]]:
     return [[entry(i, j) for j in range(i + 1)] for i in range(p)], pivot
 
 
-def _inverse_of_lower(factor: Lower) -> Lower:
+def inverse_of_lower(factor: Lower) -> Lower:
     """L⁻¹, from L with the inverses of its diagonal."""
     rows: list[list[Scalar]] = []
     for i, row in enumerate(factor):

@@ -12,6 +12,7 @@ Everything is computed from the conditions linearised at the solution
       identification       errors that are attributed to the right point
     neighbours             test of correlation between the errors of neighbouring points
       correlated           accuracy of the elements under such correlation
+    likelihood             regions and intervals where deviations do not say it all
     variance_components    standard deviations of groups, from many pairs
     sensitivity            derivatives of results by the measurements, influence of points
       budget               variance of a result by sources of error
@@ -21,6 +22,7 @@ Everything is computed from the conditions linearised at the solution
 
 from .correlated import (
     Correlated as Correlated,
+    allow_for_neighbours as allow_for_neighbours,
     correlated_covariance as correlated_covariance,
 )
 from .neighbours import Pattern as Pattern, pattern as pattern, pool as pool

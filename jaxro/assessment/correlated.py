@@ -11,16 +11,18 @@ residuals; the divisor corrects sigma0 for that, f = n - 5.
 Use it where `neighbours.pattern` finds agreement; that function estimates rho and l.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..adjustment import normal_equations as normal
-from ..geometry.linear import linearise
-from ..geometry.pairs import Pair, mask_unusable
+from ..geometry.linear import Linear, linearise
+from ..geometry.pairs import Coordinates, Pair, mask_unusable
 from ..orientation.orient import Orientation
-from .neighbours import agreement
+from .neighbours import kernel_between
 
 
 class Correlated(eqx.Module):
@@ -33,6 +35,10 @@ class Correlated(eqx.Module):
     sigma0: Float[Array, "*pairs"]
 
 
+BLOCK = 128
+"""Points whose correlations with all others are in memory at once."""
+
+
 @jax.jit
 def correlated_covariance(
     pair: Pair, orientation: Orientation, rho: ArrayLike, length: ArrayLike
@@ -40,27 +46,83 @@ def correlated_covariance(
     """The covariance of the elements of one oriented pair under correlated errors.
 
     `rho` in 0 to 1; `length` l in the unit of the coordinates, as `pattern` estimates
-    them. The pair must be oriented with rigorous residuals. Works under jit and vmap;
-    the memory grows with the square of the number of points.
+    them. The pair must be oriented with rigorous residuals. Works under jit and vmap.
     """
     pair = mask_unusable(pair)[0]
     linear = linearise(pair, orientation.elements)
-    root = jnp.sqrt(linear.weight)
-    rows = jnp.stack([column * root for column in linear.columns])
     inverse, _ = normal.inverse(linear.normal_equations()[0])
     q = normal.dense(inverse)
-    rho, length = (jnp.asarray(x, rows.dtype) for x in (rho, length))
-    kernel = rho * agreement(linear, pair.coordinates)(length)
-    effect = q @ rows
+    rho, length = (jnp.asarray(x, q.dtype) for x in (rho, length))
+    middle = rho * _agreeing(linear, pair.coordinates, length)
 
     # tr(R K) = -tr(H K), as the diagonal of K is zero
-    freedom = orientation.degrees_of_freedom.astype(rows.dtype)
-    left = freedom - jnp.sum(effect * (rows @ kernel))
+    freedom = orientation.degrees_of_freedom.astype(q.dtype)
+    left = freedom - jnp.sum(q * middle)
     independent = orientation.sigma0**2
     variance = independent * freedom / jnp.where(left > 0, left, freedom)
 
-    covariance = variance * (q + effect @ kernel @ effect.T)
+    covariance = variance * (q + q @ middle @ q)
     ratio = jnp.diagonal(covariance) / (independent * jnp.diagonal(q))
     return Correlated(
         covariance=covariance, growth=jnp.sqrt(ratio), sigma0=jnp.sqrt(variance)
     )
+
+
+def _agreeing(
+    linear: Linear, coordinates: Coordinates, length: Float[Array, ""]
+) -> Float[Array, "5 5"]:
+    """Aᵀ W^½ K W^½ A, some rows of K after the others."""
+    root = jnp.sqrt(linear.weight)
+    rows = jnp.stack([column * root for column in linear.columns], axis=-1)
+    points = rows.shape[0]
+    of_points = rows, linear.weight, linear.gradient, coordinates
+    size = min(BLOCK, points)
+    more = -points % size
+    some = jax.tree.map(
+        lambda a: jnp.pad(a, [(0, more)] + [(0, 0)] * (a.ndim - 1)).reshape(
+            -1, size, *a.shape[1:]
+        ),
+        of_points,
+    )
+
+    def block(some: tuple) -> Float[Array, "5 5"]:
+        own, weight, gradient, places = some
+        few = linear._replace(weight=weight, gradient=gradient)
+        return own.T @ (kernel_between(few, places, linear, coordinates, length) @ rows)
+
+    # of a point with itself the kernel is 1, and K has 0
+    return jnp.sum(jax.lax.map(block, some), axis=0) - rows.T @ rows
+
+
+@jax.jit
+def allow_for_neighbours(
+    pair: Pair, orientation: Orientation, rho: ArrayLike, length: ArrayLike
+) -> Orientation:
+    """The orientation of one pair with the cofactors that it has under correlated
+    errors; everything that follows from them holds then: deviations, intervals,
+    regions. sigma0 is left as it is, the size of the residuals.
+
+    `rho` and `length`: of the pair, or of a table, by `pattern` and `pool`. Cofactors
+    that are not those of least squares grow as these do. Works under jit and vmap.
+    """
+    correlated = correlated_covariance(pair, orientation, rho, length)
+    linear = linearise(mask_unusable(pair)[0], orientation.elements)
+    inverse, _ = normal.inverse(linear.normal_equations()[0])
+    plain = _factor(normal.dense(inverse))
+    own = [[*row[:-1], 1 / row[-1]] for row in _factor(orientation.cofactor)]
+    # the growth of one is that of the other
+    turn = _dense(own) @ _dense(normal.inverse_of_lower(plain))
+    grown = correlated.covariance / orientation.sigma0**2
+    return dataclasses.replace(orientation, cofactor=turn @ grown @ turn.T)
+
+
+def _factor(q: Float[Array, "5 5"]) -> normal.Lower:
+    """L with Q = L Lᵀ, the inverses of its diagonal in place of the diagonal."""
+    return normal.cholesky([[q[i, j] for j in range(i + 1)] for i in range(len(q))])[0]
+
+
+def _dense(rows: normal.Lower) -> Float[Array, "5 5"]:
+    """A lower triangle as a matrix."""
+    zero = jnp.zeros_like(rows[0][0])
+    full = [[*row, *[zero] * (len(rows) - len(row))] for row in rows]
+    return jnp.stack([jnp.stack(row) for row in full])

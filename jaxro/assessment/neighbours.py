@@ -23,6 +23,12 @@ and its distribution is approximated by Pearson's type III with these moments (H
 1966). As l is not known, K is the sum over four lengths. For many pairs f T, its
 variance and its third moment are added up.
 
+With a K of one length alone, r' K r / r' r has for its expectation (tr(R K) + rho
+tr(R K R K)) / (f + rho tr(R K)); solved for rho this is the estimate, and l is where
+T is largest over its standard deviation, by a parabola through three of the lengths.
+Numerator and denominator of rho, and this variance, are added up over many pairs, which
+tell together what few of them tell alone.
+
 Errors along the epipolar lines change no residual: the test does not see whether they
 agree.
 """
@@ -53,6 +59,18 @@ NEAR = 1e-6
 """tr A² below which no two points are near each other at the length of the kernel."""
 
 Values = Float[Array | np.ndarray, "*pairs"]
+OfLengths = Float[Array | np.ndarray, "*pairs tried"]
+
+
+class Tried(eqx.Module):
+    """What residuals tell of each of the LENGTHS, on a last axis: the `length` in the
+    unit of the photo coordinates; the `signal` f T, its `slope` by rho, and its
+    `variance` without correlation. Of many pairs the last three are sums."""
+
+    length: OfLengths
+    signal: OfLengths
+    slope: OfLengths
+    variance: OfLengths
 
 
 class Pattern(eqx.Module):
@@ -60,11 +78,10 @@ class Pattern(eqx.Module):
     axes.
 
     `probability` that independent errors show as much agreement or more. `rho`: the
-    estimated correlation of neighbouring errors, in 0 to 1, at the likeliest of the
-    tried lengths; `length`: this length l, in the unit of the photo coordinates.
-    `score` f T, its `variance` and its `third` moment without correlation, and the
-    `information` on rho: `pool` adds these up. With fewer than two degrees of freedom,
-    and where no points are near each other, the probability is 1.
+    estimated correlation of neighbouring errors, in 0 to 1, and `length` l, in the unit
+    of the photo coordinates. `score` f T, its `variance` and its `third` moment without
+    correlation, and what was `tried`: `pool` adds these up. With fewer than two degrees
+    of freedom, and where no points are near each other, the probability is 1.
     """
 
     probability: Values
@@ -73,7 +90,7 @@ class Pattern(eqx.Module):
     score: Values
     variance: Values
     third: Values
-    information: Values
+    tried: Tried
 
     @property
     def flagged(self) -> Any:
@@ -101,20 +118,19 @@ def of_linear(linear: Linear, coordinates: tuple[Any, ...]) -> Pattern:
     lengths = [length * unit for length in LENGTHS]
     kernel_of = agreement(linear, coordinates)
     kernels = [kernel_of(length) for length in lengths]
-    estimates = [_estimate_rho(kernel, residuals) for kernel in kernels]
-    likelihoods, rhos, information = (
-        xp.stack(values) for values in zip(*estimates, strict=True)
-    )
-    best = xp.argmax(likelihoods)
+    each = zip(*(_try(kernel, residuals) for kernel in kernels), strict=True)
+    signal, slope, spread = (xp.stack(values) for values in each)
     known, score, variance, third = _score(sum(kernels), residuals)
+    tried = Tried(xp.asarray(xp.stack(lengths)), signal, slope, spread)
+    rho, length = _estimate(tried)
     return Pattern(
         probability=_tail(score, variance, third, xp),
-        rho=xp.where(known, rhos[best], 0.0),
-        length=xp.asarray(xp.stack(lengths)[best]),
+        rho=xp.where(known, rho, 0.0),
+        length=length,
         score=score,
         variance=variance,
         third=third,
-        information=xp.where(known, information[best], 0.0),
+        tried=tried,
     )
 
 
@@ -122,48 +138,112 @@ def agreement(linear: Linear, coordinates: tuple[Any, ...]) -> Callable:
     """A function that gives the matrix K for a correlation length; computed with NumPy
     if the arguments are NumPy arrays."""
     xp = namespace(linear.weight)
-    use = linear.weight > 0
-    square = sum(b * b for b in linear.gradient)
-    norm = xp.sqrt(xp.where(use, square, 1.0))
-    both = use[:, None] & use[None, :] & ~np.eye(use.shape[0], dtype=bool)
+    apart = ~np.eye(linear.weight.shape[0], dtype=bool)
+    photos = [
+        (xp.where(apart, cosines, 0.0), distance)
+        for cosines, distance in _compare(linear, coordinates, linear, coordinates)
+    ]
+    return lambda length: _sum_of_photos(photos, length)
+
+
+def kernel_between(
+    some: Linear,
+    places: tuple[Any, ...],
+    others: Linear,
+    coordinates: tuple[Any, ...],
+    length: Any,
+) -> Any:
+    """K between some points and others, with 1 for a point and itself."""
+    return _sum_of_photos(_compare(some, places, others, coordinates), length)
+
+
+def _compare(
+    some: Linear, places: tuple[Any, ...], others: Linear, coordinates: tuple[Any, ...]
+) -> list[tuple[Any, Any]]:
+    """Of both photos u . u and the squared distance, of some points and others."""
+    first, second = _directions(some), _directions(others)
     photos = []
     for part in (slice(0, 2), slice(2, 4)):
-        directions = [b / norm for b in linear.gradient[part]]
-        cosines = sum(u[:, None] * u[None, :] for u in directions)
-        distance = sum((c[:, None] - c[None, :]) ** 2 for c in coordinates[part])
-        photos.append((xp.where(both, cosines, 0.0), distance))
+        both = zip(first[part], second[part], strict=True)
+        apart = zip(places[part], coordinates[part], strict=True)
+        cosines = sum(u[:, None] * v[None, :] for u, v in both)
+        photos.append((cosines, sum((c[:, None] - d[None, :]) ** 2 for c, d in apart)))
+    return photos
 
-    return lambda length: sum(
-        cosines * xp.exp(-distance / length**2) for cosines, distance in photos
-    )
+
+def _directions(linear: Linear) -> list[Any]:
+    """u of every point, zero where it is not used."""
+    xp = namespace(linear.weight)
+    use = linear.weight > 0
+    norm = xp.sqrt(xp.where(use, sum(b * b for b in linear.gradient), 1.0))
+    return [xp.where(use, b / norm, 0.0) for b in linear.gradient]
+
+
+def _sum_of_photos(photos: list[tuple[Any, Any]], length: Any) -> Any:
+    xp = namespace(photos[0][0])
+    return sum(cosines * xp.exp(-distance / length**2) for cosines, distance in photos)
 
 
 def pool(patterns: Pattern) -> Pattern:
-    """The test of many pairs together, (pair,): their scores, variances and third
-    moments are added up.
-
-    `rho` and `length` are the means of the pairs, weighted by their information.
-    """
+    """The test of many pairs together, (pair,): what is added up of each, and the rho
+    and the length that all of them tell."""
     xp = namespace(patterns.score)
-    score, variance, third, information = (
-        xp.asarray(xp.sum(values))
-        for values in (
-            patterns.score,
-            patterns.variance,
-            patterns.third,
-            patterns.information,
-        )
+    together = lambda values: xp.asarray(xp.sum(values, axis=0))
+    score, variance, third = (
+        together(values)
+        for values in (patterns.score, patterns.variance, patterns.third)
     )
-    weight = patterns.information / xp.where(information > 0, information, 1.0)
+    each = patterns.tried
+    signal, slope, spread = map(together, (each.signal, each.slope, each.variance))
+    # pairs that tell nothing of a length have none
+    weight = each.variance + NEAR
+    length = xp.asarray(xp.sum(weight * each.length, axis=0) / xp.sum(weight, axis=0))
+    tried = Tried(length, signal, slope, spread)
+    rho, length = _estimate(tried)
     return Pattern(
         probability=_tail(score, variance, third, xp),
-        rho=xp.asarray(xp.sum(weight * patterns.rho)),
-        length=xp.asarray(xp.sum(weight * patterns.length)),
+        rho=rho,
+        length=length,
         score=score,
         variance=variance,
         third=third,
-        information=information,
+        tried=tried,
     )
+
+
+def _estimate(tried: Tried) -> tuple[Any, Any]:
+    """rho, and the length l."""
+    xp = namespace(tried.signal)
+    known = tried.variance > NEAR
+    strength = tried.signal / xp.sqrt(xp.where(known, tried.variance, 1.0))
+    strength = xp.where(known, strength, 0.0)
+    rising = known & (tried.slope > 0)
+    rho = xp.where(rising, tried.signal / xp.where(rising, tried.slope, 1.0), 0.0)
+    place = _highest(strength)
+    at = lambda values: _between(values, place)
+    length = xp.exp(at(xp.log(tried.length)))
+    return xp.asarray(at(xp.clip(rho, 0.0, 1.0))), xp.asarray(length)
+
+
+def _highest(heights: Any) -> Any:
+    """The place of the largest of some heights, between them by a parabola where those
+    beside it tell one."""
+    xp = namespace(heights)
+    last = heights.shape[-1] - 1
+    best = xp.argmax(heights)
+    inner = xp.clip(best, 1, last - 1)
+    before, there, behind = (heights[inner + k] ** 2 for k in (-1, 0, 1))
+    bend = 2 * there - before - behind
+    bent = (best == inner) & (xp.min(heights) > 0) & (bend > 0)
+    shift = 0.5 * (behind - before) / xp.where(bent, bend, 1.0)
+    return best.astype(shift.dtype) + xp.where(bent, shift, 0.0)
+
+
+def _between(values: Any, place: Any) -> Any:
+    """The value at a place between those of a row."""
+    xp = namespace(values)
+    nearness = 1 - xp.abs(np.arange(float(values.shape[-1])) - place)
+    return xp.sum(xp.maximum(nearness, 0.0) * values)
 
 
 class _Residuals(NamedTuple):
@@ -218,27 +298,18 @@ def _moments(kernel, residuals: _Residuals) -> tuple[Any, Any, Any]:
     return trace, inner - mean * projection, t
 
 
-def _estimate_rho(kernel, residuals: _Residuals) -> tuple[Any, Any, Any]:
-    """T over its standard deviation (but for a factor that all kernels share), rho, and
-    the information on rho, from one kernel.
-
-    rho solves E(r' K r) / E(r' r) = r' K r / r' r with E(r' K r) = sigma² (tr(R K) +
-    rho tr(R K R K)) and E(r' r) = sigma² (f + rho tr(R K)).
-    """
+def _try(kernel: Any, residuals: _Residuals) -> tuple[Any, Any, Any]:
+    """f T, its slope by rho, and its variance without correlation, from the kernel of
+    one length; zero without a test."""
     xp, freedom = namespace(residuals.use), residuals.freedom
     trace, inner, t = _moments(kernel, residuals)
     information = xp.sum(inner * inner)
-    known = information > NEAR
-    standardised = t / xp.sqrt(xp.where(known, information, 1.0))
+    known = residuals.enough & (information > NEAR) & (residuals.squares > 0)
     ratio = t + trace / freedom
     slope = information + trace**2 / freedom - ratio * trace
-    solvable = known & (slope > 0)
-    rho = (ratio * freedom - trace) / xp.where(slope > 0, slope, 1.0)
-    return (
-        xp.where(known, standardised, 0.0),
-        xp.clip(xp.where(solvable, rho, 0.0), 0.0, 1.0),
-        information,
-    )
+    variance = 2 * information * freedom / (freedom + 2)
+    told = t * freedom, slope, variance
+    return tuple(xp.where(known, number, 0.0) for number in told)  # pyright: ignore[reportReturnType]
 
 
 def _score(kernel, residuals: _Residuals) -> tuple[Any, Any, Any, Any]:

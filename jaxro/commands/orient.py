@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 
 from .. import __version__
+from ..batches import table_neighbours
 from ..batches.padding import plan_for
 from ..batches.ragged import Ragged
 from ..batches.table_noise import TableNoise
@@ -23,7 +24,7 @@ from ..tables import csv as tables, whole
 from ..tables.cameras import Cameras
 from ..tables.fields import TableError
 from ..tables.measured import CameraPairs, Table, tell_copies, to_ragged
-from . import other_programs, sigma as deviation
+from . import neighbours, other_programs, sigma as deviation
 from .documents import settings, show_json
 from .request import (
     MEASURED,
@@ -34,7 +35,7 @@ from .request import (
     read_cameras,
     units_of,
 )
-from .solve import Task, Told, make_results, make_verdicts, solve
+from .solve import Found, Task, Told, make_results, make_verdicts, solve
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,16 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
     if found.decided is not None:
         used = used._replace(mask=used.mask & found.decided["in_use"])
         verdicts = make_verdicts(job.table, found)
-    rigorous = job.options.residual == "rigorous"
+    told_of: dict[str, Any] = {"rotations": find_rotations(used, found.of_pairs)}
+    if job.options.residual == "rigorous":
+        patterns = find_patterns(used, found.of_pairs)
+        together = table_neighbours.pool(patterns)
+        system = job.task.system
+        of_pairs, growth = neighbours.allow(used, found.of_pairs, system, together)
+        told_of |= {"patterns": patterns, "growth": growth}
+        if growth is None:  # the misfit tells nothing of errors that agree
+            told_of["intervals"] = _intervals(job, used, found)
+        found = found._replace(of_pairs=of_pairs)
     results = make_results(
         job.table,
         job.cameras,
@@ -164,19 +174,17 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
         job.task,
         job.units,
         confidence=job.options.confidence,
-        patterns=find_patterns(used, found.of_pairs) if rigorous else {},
-        rotations=find_rotations(used, found.of_pairs),
-        intervals=find_intervals(
-            used,
-            found.of_pairs,
-            job.task.system,
-            job.task.sigma_known,
-            job.options.confidence,
-        )
-        if rigorous
-        else {},
+        **told_of,
     )
     return results, verdicts
+
+
+def _intervals(job: Job, used: Ragged, found: Found) -> dict[int, Any]:
+    """The intervals by likelihood of pairs whose deviations do not say it all."""
+    task, confidence = job.task, job.options.confidence
+    return find_intervals(
+        used, found.of_pairs, task.system, task.sigma_known, confidence
+    )
 
 
 def run(options: Options) -> bool:

@@ -177,6 +177,7 @@ BEHIND_ELEMENTS = (
         only="csv",
     ),
     Column("correlation", of=_orientation("correlation"), there="usable", only="no"),
+    Column("cofactor", of=_orientation("cofactor"), there="usable", only="no"),
     Column(
         "pose",
         of=lambda told: jnp.stack(jax.tree.leaves(told.orientation.pose)),

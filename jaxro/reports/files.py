@@ -110,6 +110,7 @@ def summary_of(results: Results, summary: dict[str, Any]) -> dict[str, Any]:
         **summary,
         "units": units,
         "pattern": _pattern(results.pattern, results.units),
+        "growth_of_deviations": results.growth,
         "pairs": [_pair(one) for one in results],
     }
 

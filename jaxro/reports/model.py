@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment import critical_values
-from ..assessment import Pattern, likelihood, neighbours
-from ..batches.buckets import choose
+from ..assessment import Pattern, likelihood
+from ..batches import table_neighbours
 from ..batches.padding import sizes
 from ..batches.ragged import Ragged
 from ..geometry.elements import (
@@ -22,12 +22,10 @@ from ..geometry.elements import (
     RelativePose,
     convert,
 )
-from ..geometry.linear import Linear, linearise
-from ..geometry.pairs import Camera, Coordinates, Pair, mask_unusable
+from ..geometry.pairs import Camera, Pair
 from ..orientation.pure_rotation import PureRotation, orient_rotation
 from ..tables.measured import CameraPairs, Table, take, to_list
 from ..xla.programs import compiled
-from ..xla.settings import MOMENT, settings_for
 from .columns import (
     RESULT_ADVICE,
     RESULT_NAMES,
@@ -42,13 +40,8 @@ from .columns import (
 )
 from .reader import report_numbers
 
-MOST_POINTS = 200
-"""Points of a pair whose residuals are looked at together: of more, every second,
-third, ... one."""
-
 MOST_PAIRS = 100
-"""Pairs of a table whose residuals are tested for a pattern: of more, every second,
-third, ... one."""
+"""Pairs of a table of which more is told than their elements."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +63,8 @@ class Results:
     """Oriented pairs: the columns of the pairs and, by table, of the points that
     `table` holds, those kept. `confidence`: of the intervals that are asked for. By the
     numbers of the pairs: `patterns`, `rotations` of pairs without a base, `intervals`
-    by likelihood of pairs whose deviations do not say it all."""
+    by likelihood of pairs whose deviations do not say it all. `growth`: by how much
+    deviations allow for neighbours that agree; None where none do."""
 
     table: Table
     cameras: CameraPairs
@@ -83,6 +77,7 @@ class Results:
     patterns: dict[int, Pattern] = field(default_factory=dict)
     rotations: dict[int, PureRotation] = field(default_factory=dict)
     intervals: dict[int, likelihood.Interval] = field(default_factory=dict)
+    growth: float | None = None
 
     def __len__(self) -> int:
         return len(self.table.names)
@@ -131,10 +126,7 @@ class Results:
     @cached_property
     def pattern(self) -> Pattern | None:
         """The test of all pairs together; None where nothing tells."""
-        found = list(self.patterns.values())
-        if not found:
-            return None
-        return neighbours.pool(jax.tree.map(lambda *a: np.stack(a), *found))
+        return table_neighbours.pool(self.patterns)
 
 
 @dataclass(frozen=True)
@@ -315,39 +307,7 @@ def _find_interval(
 
 
 def find_patterns(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, Pattern]:
-    """Whether residuals of neighbouring points agree, by the numbers of the pairs: of
-    at most MOST_PAIRS pairs with two degrees of freedom, MOST_POINTS points of each."""
-    count = len(pairs.lengths)
-    chosen = np.arange(0, count, max(1, -(-count // MOST_PAIRS)))
+    """Whether residuals of neighbouring points agree, by the numbers of the pairs; of
+    some pairs."""
     tells = is_usable(of_pairs["result"]) & (of_pairs["degrees_of_freedom"] >= 2)
-    chosen = chosen[tells[chosen]]
-    if not chosen.size:
-        return {}
-    rows = []
-    for begin, end in zip(pairs.begins[chosen], pairs.begins[chosen + 1], strict=True):
-        used = begin + np.flatnonzero(pairs.mask[begin:end])
-        rows.append(used[:: -(-len(used) // MOST_POINTS)])
-    thinned = choose(pairs, chosen, rows)
-    lengths = thinned.lengths
-    batch = thinned.pad_to(np.arange(len(chosen)), sizes(lengths, 1)[0])
-    read = _linearise(batch, of_pairs["pose"][chosen])
-    conditions = jax.tree.map(np.asarray, read)
-    return {
-        int(number): neighbours.of_linear(
-            *jax.tree.map(lambda a, k=k, n=n: a[k, :n], conditions)
-        )
-        for k, (number, n) in enumerate(zip(chosen, lengths, strict=True))
-    }
-
-
-@compiled(settings=lambda pairs, _: settings_for(pairs.x_left.size, MOMENT))
-def _linearise(
-    pairs: Pair, poses: Float[Array, "pair 7"]
-) -> tuple[Linear, Coordinates]:
-    """The linearised conditions of pairs at their poses, and the coordinates."""
-
-    def one(pair: Pair, pose: Float[Array, "7"]) -> tuple[Linear, Coordinates]:
-        used = mask_unusable(pair)[0]
-        return linearise(used, RelativePose(*pose)), used.coordinates
-
-    return jax.vmap(one)(pairs, poses)
+    return table_neighbours.find(pairs, of_pairs["pose"], tells)

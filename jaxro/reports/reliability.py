@@ -7,10 +7,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..adjustment import critical_values
-from ..assessment import Pattern
 from ..assessment.likelihood import CURVED
 from ..assessment.reliability import BOUNDS
-from .columns import Units
 from .model import USUAL, Element, One, Results
 from .pair import digits, join_names, table, unit_name
 from .rows import left_out, worst
@@ -93,7 +91,8 @@ def sentences(one: One) -> list[str]:
             "give --sigma."
         )
     said += doubts(one)
-    said += pattern_sentences(one.pattern, one.results.units)
+    if len(one.results) == 1:
+        said += _neighbours(one.results)
     return said + _bent_deviations(one) + _weak_points(one, points)
 
 
@@ -111,9 +110,7 @@ def chance_of_sigma0(one: One) -> float:
 
 def sentences_of_many(results: Results) -> list[str]:
     """What to mind of all pairs together."""
-    return _doubt_sigma_of_many(results) + pattern_sentences(
-        results.pattern, results.units, " of all pairs together"
-    )
+    return _doubt_sigma_of_many(results) + _neighbours(results)
 
 
 def find_too_large(results: Results) -> Bool[np.ndarray, " pair"]:
@@ -168,18 +165,25 @@ def _weak_points(one: One, points: dict[str, np.ndarray]) -> list[str]:
     return said
 
 
-def pattern_sentences(pattern: Pattern | None, units: Units, of: str = "") -> list[str]:
-    """What a pattern in the residuals means, if there is one."""
+def _neighbours(results: Results) -> list[str]:
+    """What it means that neighbours agree, where they do."""
+    pattern, units = results.pattern, results.units
     if pattern is None or not pattern.flagged:
         return []
     rho, length, chance = (
         float(x) for x in (pattern.rho, pattern.length, pattern.probability)
     )
+    of = "" if len(results) == 1 else " of all pairs together"
+    said = (
+        f"The errors of neighbours{of} agree by {number(rho, 1)}, over about "
+        f"{number(length, digits(length, 0))} {units.photo} (probability {chance:.1g})"
+    )
+    if results.growth is None:
+        return [f"{said}: the standard deviations are too small."]
+    larger = number(results.growth, digits(results.growth, 1))
     return [
-        f"The standard deviations assume independent errors; here neighbours{of} agree "
-        f"by {number(rho, 1)}, over about "
-        f"{number(length, digits(length, 0))} {units.photo} (probability "
-        f"{chance:.1g}): they are too small."
+        f"{said}: the standard deviations allow for it, and are {larger} times those of "
+        "independent errors."
     ]
 
 
