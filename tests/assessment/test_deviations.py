@@ -171,6 +171,7 @@ def test_second_orientation_of_a_plane_has_the_same_homography():
     assert max(turn, shift) > 0.05
 
 
+@pytest.mark.slow
 def test_after_cleaning_tells_what_a_procedure_is_worth():
     """Errors of a dozen sigma are found nearly always, of four only at times; without
     any the region holds 95 %."""

@@ -94,6 +94,7 @@ def test_the_ends_are_those_of_a_search():
             assert 2 * least.cost - lowest == pytest.approx(float(limit), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_region_and_its_numbers_do_not_depend_on_the_elements():
     """Which poses are in the region, and from where to where kappa reaches, is the same
     whatever elements describe them."""

@@ -225,10 +225,8 @@ def test_padding_and_sigma_change_nothing():
     assert pattern(six, jaxro.orient(six)).probability == 1  # one degree of freedom
 
 
-@pytest.mark.parametrize(
-    "elements",
-    [pytest.param(jaxro.RelativePose, marks=pytest.mark.slow), IndependentElements],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("elements", [jaxro.RelativePose, IndependentElements])
 def test_correlated_covariance_is_the_scatter(elements):
     """The deviations of AT_ONCE orientations from correlated errors, which are known to
     a thirtieth; without correlation those of the adjustment."""

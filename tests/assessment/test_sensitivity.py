@@ -371,6 +371,7 @@ def test_error_budget_adds_up():
         )
 
 
+@pytest.mark.slow
 def test_error_budget_is_made_of_the_derivatives():
     """Σ (dh/dl)² s²; one error of both focal lengths counts once; the base scales the
     model."""
@@ -430,6 +431,7 @@ def test_propagation_equals_simulation(trials, within):
     np.testing.assert_allclose(np.sqrt(coordinates), heights, rtol=within)
 
 
+@pytest.mark.slow
 def test_influence_and_leave_one_out():
     """Dewitt's six points: the refits are exact solutions of five conditions. With five
     points none can be left out."""

@@ -111,6 +111,7 @@ def test_classes_of_points_in_near_vertical_pairs():
     np.testing.assert_allclose(again.sigma, result.sigma, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_both_photos_of_convergent_pairs():
     pairs, found = batch(CONVERGENT, "by photo")
     result = components.by_photo(pairs, found)

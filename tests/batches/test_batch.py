@@ -159,6 +159,7 @@ def _sigma0(orientation):
     return orientation.sigma0
 
 
+@pytest.mark.slow
 def test_programs_of_functions_without_a_name_are_told_apart(near, tmp_path):
     """A kept program of a lambda is known by what it computes."""
     few = jax.tree.map(lambda a: a[:7], near)

@@ -47,6 +47,7 @@ def together(pairs):
 PLAN = padding.Plan((8, 12), (4, 4), (12,))
 
 
+@pytest.mark.slow
 def test_ragged_equals_one_by_one(pairs, together):
     told = []
     found = ragged.orient_ragged(

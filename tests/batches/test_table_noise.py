@@ -100,6 +100,7 @@ def small():
     return pairs, table_noise.estimate(pairs)
 
 
+@pytest.mark.slow
 def test_sigma_is_in_the_unit_of_the_coordinates_and_a_multiple_of_the_pair_s(small):
     """Another unit, or a stated sigma, changes the number accordingly; lists, ragged
     pairs and batches agree."""

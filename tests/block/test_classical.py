@@ -29,6 +29,7 @@ def strip():
     return mock, start_from(few, mock.photos)
 
 
+@pytest.mark.slow
 def test_it_is_that_of_a_dense_adjustment(strip):
     """Estimates, sigma0 and claimed deviations in plain NumPy. A model has an affine
     map of twelve numbers and five conditions that make it a similarity."""

@@ -145,7 +145,8 @@ def test_from_pairs_in_any_order_to_the_truth(flight):
     assert np.sum(oriented.wrong.rays) <= 2
 
 
-@pytest.mark.parametrize("share", [pytest.param(0.05, marks=pytest.mark.slow), 0.2])
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.05, 0.2])
 def test_wrong_ties_are_found(share):
     """From the pairs alone."""
     mock = block.mock_block(3, block.Flight(strips=3, models=8))

@@ -128,17 +128,15 @@ def slow(model):
     return pytest.param(model, marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model",
-    [ONE]
-    + [
-        slow(m)
-        for m in (
-            LINEAR,
-            STRIPS,
-            Model(x=calibration.rectangles(2, 2)),
-            Model(x=TURNED.y),
-        )
+    [
+        ONE,
+        LINEAR,
+        STRIPS,
+        Model(x=calibration.rectangles(2, 2)),
+        Model(x=TURNED.y),
     ],
     ids=["one", "linear", "strips", "rectangles", "rings"],
 )

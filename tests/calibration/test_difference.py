@@ -99,6 +99,7 @@ def test_the_statistic_is_that_of_an_independent_adjustment():
     np.testing.assert_allclose(found.f, f, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_another_film_is_found():
     same = compared(2, FILM, film)
     other = compared(2, FILM, film, lambda rng: film(rng, 5.0))

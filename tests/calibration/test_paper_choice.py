@@ -18,6 +18,7 @@ def image(mask=None):
     return simulated_image.image(points, places, mask=mask)
 
 
+@pytest.mark.slow
 def test_the_rules_of_the_paper():
     """With each model's own calibration, in mrad, mm and mm."""
     measured = image()

@@ -60,6 +60,7 @@ def test_poses_are_right_as_often_as_those_of_colmap(verdicts):
     assert np.mean(ours[:, 3]) < 1.1 * np.mean(theirs[:, 3])
 
 
+@pytest.mark.slow
 def test_keypoints_beside_the_photo_are_counted_and_left_out(tmp_path):
     """A fisheye that sees 210°, r = f θ: a seventh of the keypoints lies beyond 90°."""
     rng, path = np.random.default_rng(1), tmp_path / "wide.db"

@@ -48,6 +48,7 @@ def written(made, tmp_path_factory):
     return folder / "out"
 
 
+@pytest.mark.slow
 def test_the_tables_of_a_simulated_block_give_its_numbers(example, written, tables):
     """Names, orders and units survive; what is wrong is named."""
     told = example("block")

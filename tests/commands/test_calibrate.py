@@ -46,6 +46,7 @@ def files(folder, film):
     )
 
 
+@pytest.mark.slow
 def test_the_figures_are_those_of_python(tmp_path):
     """Files and report of one image hold the numbers that the interface of Python
     gives."""

@@ -101,6 +101,7 @@ def test_each_image_has_a_camera_of_its_own(three_cameras):
         assert of_y0 < 0.021 * float(found.sigma0)
 
 
+@pytest.mark.slow
 def test_known_numbers_need_the_sigma_of_the_places(three_cameras):
     """Else they are weighed against places of the standard deviation 1."""
     (images, points), _ = three_cameras

@@ -56,6 +56,7 @@ def compare(folder, tables, *asked, model="brown"):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("film", [0.0, 0.1])
 def test_the_difference_of_two_distortions(film, tmp_path):
     """Map, test and what is taken out are those of Python."""

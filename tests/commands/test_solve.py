@@ -39,6 +39,7 @@ def pairs():
     ]
 
 
+@pytest.mark.slow
 def test_a_table_tells_what_the_procedure_found(pairs):
     """Its verdict, sigma0, elements and their deviations: planes with two poses,
     rotations, and weights that fade."""

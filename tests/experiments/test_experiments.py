@@ -111,6 +111,7 @@ def test_known_procedures_get_exactly_their_shares(shares):
             ), key
 
 
+@pytest.mark.slow
 def test_trials_have_their_errors_and_the_angle_is_that_of_the_oracle(shares):
     setting = Setting("rows", 2, 20.0)
     pairs, wrong = compare.simulate(EXACT, setting, TRIALS, 0)
@@ -408,6 +409,7 @@ def paper_1989():
     return burshtynskaya1989.run()
 
 
+@pytest.mark.slow
 def test_one_tolerance_reproduces_all_three_described_pairs_of_1989(paper_1989):
     """II-13: 14 and 16 go, III-7: 15, II-9: 7, for eps4 in (.0405, .0464] mm; with the
     other layout for none."""

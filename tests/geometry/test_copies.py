@@ -83,6 +83,7 @@ def test_five_points_prove_nothing_however_often_they_stand_there(apart):
     assert found.orientation.result != jaxro.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_a_table_says_which_points_repeat_others(tmp_path):
     """They have the residuals of what they repeat, are kept or rejected with it, and
     count once."""

@@ -317,10 +317,11 @@ def with_wrong():
     return plant(moved, y_right=jnp.where(jnp.asarray(wrong), 0.12, 0.0)), wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "procedure",
     [
-        pytest.param(rejection.Recommended(), marks=pytest.mark.slow),
+        rejection.Recommended(),
         rejection.DataSnooping(),
     ],
     ids=["recommended", "data snooping"],

@@ -38,6 +38,7 @@ def test_subsets_are_solved_to_their_noise():
     assert np.median(error) < 1e-5 and np.quantile(error, 0.95) < 1e-3
 
 
+@pytest.mark.slow
 def test_first_steps_leave_nothing_in_the_solution():
     """Two steps in single precision end within 2e-4 rad, and the solution is that
     without them, to its tolerance."""

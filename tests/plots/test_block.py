@@ -35,6 +35,7 @@ def known_points(made):
     ]
 
 
+@pytest.mark.slow
 def test_differences_are_drawn_at_known_points_by_one_factor(made):
     _, oriented = made
     adjusted, known = oriented.adjusted, known_points(made)

@@ -77,6 +77,7 @@ def test_rings_are_circles_about_the_principal_place(plain, degree):
     np.testing.assert_allclose(drawn, radius, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_zones_of_any_form_are_told_by_their_numbers(plain):
     """The border lies between nodes of different numbers."""
     number = lambda u: (u[:, 0] + u[:, 1] > 0).astype(int)

@@ -188,6 +188,7 @@ def test_data_snooping_is_that_of_numpy(estimated, count):
     assert np.mean((order > 0) == wrong) > 0.9 and np.any(undecided)
 
 
+@pytest.mark.slow
 def test_all_subsets_finds_the_fewest_omissions_that_fit():
     """As NumPy, which solves each of the 176; large errors, of which three of ten
     points hide one another."""

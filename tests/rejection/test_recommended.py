@@ -65,7 +65,8 @@ def layout_of_1989(count: int, seed: int):
     )
 
 
-@pytest.mark.parametrize("count", [24, pytest.param(1024, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [24, 1024])
 def test_of_few_points_no_other_choice_costs_less(count):
     """16 points, three wrong by 1 to 10 mm: of all choices of up to five omissions,
     those of the least cost, in NumPy linear about the solution of the good points. Of a

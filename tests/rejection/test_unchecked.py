@@ -57,7 +57,10 @@ def squared_distances(pose, covariance, found):
     return np.array(squares)
 
 
-@pytest.mark.parametrize(("wrong", "least"), [(0.0, 0.9), (0.2, 0.8)])
+@pytest.mark.parametrize(
+    ("wrong", "least"),
+    [pytest.param(0.0, 0.9, marks=pytest.mark.slow), (0.2, 0.8)],
+)
 def test_the_regions_of_a_forward_facade_hold(wrong, least):
     """95 % regions of 60 pairs, nearly all of them usable; one wrong point kept without a check
     would put half of them out of theirs."""
@@ -103,6 +106,7 @@ def with_a_pole(count):
 CHANCE = 0.004
 
 
+@pytest.mark.slow
 def test_one_point_on_a_pole_is_unchecked_and_many_are_not():
     """One right point tells as much of the base as one of 120 wrong ones by chance;
     twenty of them tell what no accident does."""
