@@ -8,6 +8,7 @@ then cleans the pair, and its points and pose are compared with the truth.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -21,35 +22,47 @@ from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
 from ..geometry.mock_pairs import draw_points, plant
 from ..geometry.pairs import Pair, mask_unusable
+from ..orientation.result import Orientation
 from ..orientation.results import is_usable
 from ..rejection import AbstractProcedure, Rejection
 from ..xla.passes import count
-from .batch import map_batch
+from .batch import clean_batch
 
 
 class AfterCleaning(NamedTuple):
     """Shares of the `repetitions`, from 0 to 1.
 
-    `answered`: cleaned, with a usable orientation; all other shares are of those.
-    `exactly_right`: just the wrong points rejected. `without_wrong`: no wrong point
-    kept. `coverage`: the true pose in the region promised at the `confidence`, a
-    posteriori; `coverage_known`: a priori, by the given sigma. `inflation`: root mean
-    square of the pose's errors over the promised ones (1 where they are honest). A
+    `answered`: cleaned, with a usable orientation. Of those: `exactly_right`: just the
+    wrong points rejected; `without_wrong`: no wrong point kept; `alike`: as many points
+    rejected as of the pair itself. Of the ones alike, which had the same decision, and
+    NaN if there are none: `coverage`: the true pose in the region promised at the `confidence`, a
+    posteriori; `coverage_known`: a priori, by the given sigma. `intervals`, and
+    `intervals_known`: the same of the interval of each element alone. `inflation`: root
+    mean square of the pose's errors over the promised ones (1 where they are honest). A
     share p has the standard deviation sqrt(p (1 - p) / repetitions).
     """
 
     answered: Float[Array, ""]
     exactly_right: Float[Array, ""]
     without_wrong: Float[Array, ""]
+    alike: Float[Array, ""]
     coverage: Float[Array, ""]
     coverage_known: Float[Array, ""]
+    intervals: Float[Array, "element"]
+    intervals_known: Float[Array, "element"]
     inflation: Float[Array, ""]
     confidence: float
     repetitions: int
 
 
+Tell = Callable[[Pair, Orientation], tuple[Array, Array]]
+"""What is promised of an orientation: the errors of some elements against the truth, and
+their standard deviations."""
+
+
 class Found(NamedTuple):
-    """The results of a procedure that are compared with the truth."""
+    """The results of a procedure that are compared with the truth; `errors` and
+    `deviations` of the elements."""
 
     pose: RelativePose
     usable: Bool[Array, "..."]
@@ -57,6 +70,8 @@ class Found(NamedTuple):
     cofactor: Float[Array, "*repetition 5 5"]
     sigma0: Float[Array, "..."]
     degrees_of_freedom: Int[Array, "..."]
+    errors: Float[Array, "*repetition element"]
+    deviations: Float[Array, "*repetition element"]
 
 
 class Trial(NamedTuple):
@@ -68,6 +83,8 @@ class Trial(NamedTuple):
     without_wrong: Bool[Array, "..."]
     inside: Bool[Array, "..."]
     inside_known: Bool[Array, "..."]
+    intervals: Bool[Array, "*repetition element"]
+    intervals_known: Bool[Array, "*repetition element"]
     ratio: Float[Array, "..."]
 
 
@@ -92,32 +109,74 @@ def after_cleaning(
     ten sigma. Smaller errors are harder to find: the shares hold for errors of this
     size.
     """
+    return repeat_cleaning(
+        pair,
+        rejection.orientation.pose,
+        rejection.mask,
+        procedure,
+        key,
+        repetitions=repetitions,
+        sigma0=sigma0,
+        largest=largest,
+        confidence=confidence,
+    )
+
+
+def repeat_cleaning(
+    pair: Pair,
+    pose: RelativePose,
+    kept: Bool[Array, "point"],
+    procedure: AbstractProcedure,
+    key: PRNGKeyArray,
+    *,
+    repetitions: int = 1000,
+    sigma0: ArrayLike | None = None,
+    largest: float | None = None,
+    confidence: float = 0.95,
+    tell: Tell | None = None,
+) -> AfterCleaning:
+    """`after_cleaning` of a pair that a procedure oriented like this, with these points
+    kept. `tell`: the elements whose intervals are looked at; the five local ones of the
+    pose if not given."""
     pair, _ = mask_unusable(pair)
     pairs, wrong = simulate(
-        pair, rejection, key, repetitions, sigma0=sigma0, largest=largest
+        pair, pose, kept, key, repetitions, sigma0=sigma0, largest=largest
     )
-    found = map_batch(_Clean(procedure), pairs)
-    truth = rejection.orientation.pose
-    each = compare(pair, truth, wrong, found, sigma0, confidence)
-    answered = count(each.answered)
-    mean = lambda sum_: sum_ / jnp.maximum(answered, 1.0)
-    share = lambda held: mean(count(held & each.answered))
-    ratio = jnp.where(each.answered, each.ratio, 0.0)
+    tell = _OfPose(pose) if tell is None else tell
+    found = clean_batch(pairs, procedure, read=_Read(tell))
+    each = compare(pair, pose, wrong, found, sigma0, confidence)
+    number = jnp.sum(pair.mask & ~kept)
+    same = jnp.sum(pair.mask[None, :] & ~found.mask, axis=1) == number
+    alike = each.answered & same
+    answered, of_those = (_share_of(chosen) for chosen in (each.answered, alike))
+    of_each = jax.vmap(of_those, in_axes=1)
+    ratio = jnp.sum(jnp.where(alike, each.ratio, 0.0)) / count(alike)
     return AfterCleaning(
-        answered=answered / repetitions,
-        exactly_right=share(each.exactly_right),
-        without_wrong=share(each.without_wrong),
-        coverage=share(each.inside),
-        coverage_known=share(each.inside_known),
-        inflation=jnp.sqrt(mean(jnp.sum(ratio))),
+        answered=count(each.answered) / repetitions,
+        exactly_right=answered(each.exactly_right),
+        without_wrong=answered(each.without_wrong),
+        alike=answered(same),
+        coverage=of_those(each.inside),
+        coverage_known=of_those(each.inside_known),
+        intervals=of_each(each.intervals),
+        intervals_known=of_each(each.intervals_known),
+        inflation=jnp.sqrt(ratio),
         confidence=confidence,
         repetitions=repetitions,
     )
 
 
+def _share_of(
+    chosen: Bool[Array, "repetition"],
+) -> Callable[[Bool[Array, "repetition"]], Float[Array, ""]]:
+    """The share of the chosen repetitions in which something holds."""
+    return lambda held: count(held & chosen) / count(chosen)
+
+
 def simulate(
     pair: Pair,
-    rejection: Rejection,
+    pose: RelativePose,
+    kept: Bool[Array, "point"],
     key: PRNGKeyArray,
     repetitions: int,
     *,
@@ -131,8 +190,7 @@ def simulate(
     lies on the ray that a kept point of similar place suggests: the model point at the
     mean depth of those kept.
     """
-    pose = rejection.orientation.pose
-    kept, rejected = pair.mask & rejection.mask, pair.mask & ~rejection.mask
+    kept, rejected = pair.mask & kept, pair.mask & ~kept
     unit = jnp.asarray(1.0 if sigma0 is None else sigma0, pair.sigma.dtype)
     most = largest
     if largest is None:
@@ -268,12 +326,20 @@ def compare(
     limit = jax.vmap(limit_of)(freedom.astype(squared.dtype))
     limit_known = critical_values.chi_squared(1 - confidence, 5)
     right_kept = found.mask ^ wrong
+    half = lambda f: critical_values.half_width(confidence, f)
+    factor = jax.vmap(lambda f: critical_values.by_count(half, most, f))
+    width = found.deviations * factor(freedom.astype(squared.dtype))[:, None]
+    sigma0 = jnp.where(fine, found.sigma0, 1.0)
+    known_width = critical_values.normal(1 - confidence) * unit / sigma0
+    errors = jnp.abs(found.errors)
     return Trial(
         answered=fine,
         exactly_right=jnp.all(right_kept | ~pair.mask[None, :], axis=1),
         without_wrong=~jnp.any(found.mask & wrong, axis=1),
         inside=squared <= limit * variance,
         inside_known=squared <= limit_known * unit**2,
+        intervals=errors <= width,
+        intervals_known=errors <= found.deviations * known_width[:, None],
         ratio=squared / (5 * variance),
     )
 
@@ -304,15 +370,26 @@ def _mahalanobis(cofactor: Float[Array, "5 5"], away: list[Array]) -> Float[Arra
     return sum(products[1:], products[0])
 
 
-class _Clean(eqx.Module):
-    """A procedure as a function of one pair with the results that are compared with the
-    truth."""
+class _OfPose(eqx.Module):
+    """What is promised of the five local elements of a pose."""
 
-    procedure: AbstractProcedure
+    truth: RelativePose
 
-    def __call__(self, pair: Pair) -> Found:
-        rejection = self.procedure(pair)
+    def __call__(self, pair: Pair, orientation: Orientation) -> tuple[Array, Array]:
+        del pair
+        away = difference(self.truth, orientation.pose)
+        return jnp.stack(away), orientation.deviations
+
+
+class _Read(eqx.Module):
+    """The results of a procedure that are compared with the truth."""
+
+    tell: Tell
+
+    def __call__(self, pair: Pair, rejection: Rejection) -> Found:
         orientation = rejection.orientation
+        kept = pair.with_mask(rejection.mask)
+        errors, deviations = self.tell(kept, orientation)
         return Found(
             pose=orientation.pose,
             usable=is_usable(orientation.result),
@@ -320,4 +397,6 @@ class _Clean(eqx.Module):
             cofactor=orientation.cofactor,
             sigma0=orientation.sigma0,
             degrees_of_freedom=orientation.degrees_of_freedom,
+            errors=errors,
+            deviations=deviations,
         )

@@ -8,7 +8,7 @@ agree hold a half of what they promise, or less, where errors are taken as indep
 (docs/reliability.md).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -87,11 +87,11 @@ class Agreeing(NamedTuple):
 
     pair: Pair
     orientation: Orientation
-    rho: Float[Array, "..."]
-    length: Float[Array, "..."]
+    rho: Float[Any, "*pairs"]
+    length: Float[Any, "*pairs"]
 
     @property
-    def x_left(self) -> Float[Array, "*pairs point"]:
+    def x_left(self) -> Float[Any, "*pairs point"]:
         """Of the pair, by which batches are split."""
         return self.pair.x_left
 

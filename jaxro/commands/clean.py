@@ -4,10 +4,10 @@ told and written."""
 from ..rejection import PROCEDURES, AbstractProcedure
 from ..reports import cleaning as report, files, verdicts as decisions
 from ..reports.html.pairs import Cleaned
-from ..reports.terminal import consoles, progress
+from ..reports.terminal import consoles, progress, say_what
 from ..tables.examples import mock_pair as example
 from ..tables.fields import TableError
-from . import orient as jobs, sigma
+from . import orient as jobs, promise, sigma
 from .documents import show_json
 from .request import Example, Options
 from .tolerances import change, check_sigma, tolerances
@@ -18,9 +18,12 @@ DEFAULT = "recommended"
 SIMULATED = Example(example.NAME, example.FOCAL, example.TABLE)
 
 
-def run(options: Options, name: str, changes: list[str]) -> bool:
+def run(
+    options: Options, name: str, changes: list[str], repetitions: int | None = None
+) -> bool:
     """Read, clean, orient, write, show. True if every pair is cleaned and usable.
-    Raises TableError."""
+    `repetitions` of the simulation of what the intervals hold, if that is wanted. Raises
+    TableError."""
     procedure = change(find_procedure(name), changes)
     console, errors = consoles()
     with jobs.writing(options) as write:
@@ -30,6 +33,9 @@ def run(options: Options, name: str, changes: list[str]) -> bool:
         with progress(errors, "Cleaning", len(job.table.names)) as told:
             results, verdicts = jobs.solve_table(job, told)
         assert verdicts is not None
+        if repetitions is not None:
+            with say_what("Simulating pairs like these ..."):
+                results = promise.add(job, results, verdicts, repetitions)
         summary = job.summary(results)
         heading = {
             "program": summary["program"],

@@ -30,9 +30,10 @@ def to_arrow(result: Any, table: str = "", *, units: Units = NO_NAMES) -> Any:
     """A table of a result, as a `pyarrow.Table`.
 
     `result` and its tables, of which the first is the default: an `Orientation` of a
-    pair or of a batch ("elements"); `Results` of pairs ("elements", "residuals",
-    "points", "reliability"); a finished block ("photos", "points", "residuals", ...); a
-    finished calibration ("cameras", "stations", ...). `units`: those of an
+    pair or of a batch ("elements", but for what needs the pair); `Results` of pairs
+    ("elements", "residuals", "points", "reliability"); a finished block ("photos",
+    "points", "residuals", ...); a finished calibration ("cameras", "stations", ...).
+    `units`: those of an
     `Orientation`. Raises ValueError for a table that the result has not got, TypeError
     for a result without tables.
     """

@@ -132,7 +132,28 @@ def _pair(one: One) -> dict[str, Any]:
         "correlations": one.correlations,
         "rotation": _rotation(one.rotation),
         "pattern": _pattern(one.pattern, one.results.units),
+        "promise": _promise(one),
         "cameras": [_camera(camera) for camera in one.cameras],
+    }
+
+
+def _promise(one: One) -> dict[str, Any] | None:
+    """What simulation says that the intervals of a cleaned pair hold."""
+    told = one.promise
+    if told is None:
+        return None
+    known = one.results.sigma_known
+    each = told.intervals_known if known else told.intervals
+    names = [e.name for e in one.elements]
+    return {
+        "repetitions": told.repetitions,
+        "confidence": told.confidence,
+        "answered": float(told.answered),
+        "exactly_right": float(told.exactly_right),
+        "without_wrong": float(told.without_wrong),
+        "alike": float(told.alike),
+        "region": float(told.coverage_known if known else told.coverage),
+        "intervals": dict(zip(names, map(float, each), strict=True)),
     }
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from ..adjustment import critical_values
 from ..assessment import Pattern, likelihood
 from ..batches import table_neighbours
+from ..batches.after_cleaning import AfterCleaning
 from ..batches.padding import sizes
 from ..batches.ragged import Ragged
 from ..geometry.elements import (
@@ -64,7 +65,8 @@ class Results:
     `table` holds, those kept. `confidence`: of the intervals that are asked for. By the
     numbers of the pairs: `patterns`, `rotations` of pairs without a base, `intervals`
     by likelihood of pairs whose deviations do not say it all. `growth`: by how much
-    deviations allow for neighbours that agree; None where none do."""
+    deviations allow for neighbours that agree; None where none do. `promises`: what
+    intervals really hold after cleaning, where that was simulated."""
 
     table: Table
     cameras: CameraPairs
@@ -78,6 +80,7 @@ class Results:
     rotations: dict[int, PureRotation] = field(default_factory=dict)
     intervals: dict[int, likelihood.Interval] = field(default_factory=dict)
     growth: float | None = None
+    promises: dict[int, AfterCleaning] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.table.names)
@@ -229,6 +232,11 @@ class One:
     def pattern(self) -> Pattern | None:
         """Whether residuals of neighbouring points agree; None where nothing tells."""
         return self.results.patterns.get(self.number)
+
+    @property
+    def promise(self) -> AfterCleaning | None:
+        """What its intervals really hold; None where that was not simulated."""
+        return self.results.promises.get(self.number)
 
     @property
     def rotation(self) -> PureRotation | None:

@@ -93,7 +93,8 @@ def sentences(one: One) -> list[str]:
     said += doubts(one)
     if len(one.results) == 1:
         said += _neighbours(one.results)
-    return said + _bent_deviations(one) + _weak_points(one, points)
+    said += _bent_deviations(one) + _weak_points(one, points)
+    return said + promises(one)
 
 
 def doubts(one: One) -> list[str]:
@@ -110,7 +111,8 @@ def chance_of_sigma0(one: One) -> float:
 
 def sentences_of_many(results: Results) -> list[str]:
     """What to mind of all pairs together."""
-    return _doubt_sigma_of_many(results) + _neighbours(results)
+    promised = [f"{one.name}: {said}" for one in results for said in promises(one)]
+    return _doubt_sigma_of_many(results) + _neighbours(results) + promised
 
 
 def find_too_large(results: Results) -> Bool[np.ndarray, " pair"]:
@@ -184,6 +186,30 @@ def _neighbours(results: Results) -> list[str]:
     return [
         f"{said}: the standard deviations allow for it, and are {larger} times those of "
         "independent errors."
+    ]
+
+
+def promises(one: One) -> list[str]:
+    """What simulation says that the intervals of a cleaned pair hold."""
+    told = one.promise
+    if told is None:
+        return []
+    percent = lambda share: f"{100 * float(share):.0f} %"
+    known = one.results.sigma_known
+    each = told.intervals_known if known else told.intervals
+    region = told.coverage_known if known else told.coverage
+    listed = ", ".join(
+        f"{e.name} {percent(share)}"
+        for e, share in zip(one.elements, each, strict=True)
+        if e.deviation is not None
+    )
+    return [
+        f"In {told.repetitions} simulated pairs like this one, with as many wrong points "
+        f"of the same size, {percent(told.answered)} were oriented, "
+        f"{percent(told.exactly_right)} of these with just the right points. After the "
+        f"same decision, in {percent(told.alike)}, intervals of "
+        f"{percent(told.confidence)} hold {listed}, and the joint region "
+        f"{percent(region)}."
     ]
 
 

@@ -11,6 +11,7 @@ import scipy.stats
 import jaxro
 from jaxro import IndependentElements, losses, rejection
 from jaxro.adjustment import m_estimates
+from jaxro.batches.after_cleaning import difference
 from jaxro.geometry import mock_pairs
 from jaxro.orientation import planes
 
@@ -134,8 +135,6 @@ def test_intervals_of_few_points_called_successful(points, sigma):
     found = jaxro.orient_batch(
         jax.vmap(mock_pairs.noisy, in_axes=(0, 0, None))(pairs, keys, sigma)
     )
-    from jaxro.batches.after_cleaning import difference
-
     away = np.abs(np.stack(jax.vmap(difference)(found.pose, true), axis=1))
     successful = np.asarray(found.result == jaxro.RESULTS.successful)
     inside = away[successful] <= np.asarray(found.interval(0.95))[successful]
@@ -195,3 +194,36 @@ def test_after_cleaning_tells_what_a_procedure_is_worth():
         assert least <= told.exactly_right <= most
         assert told.without_wrong >= told.exactly_right
     assert told.without_wrong == 1 and 0.9 < told.coverage < 0.98
+    for each in (told.intervals, told.intervals_known):
+        np.testing.assert_allclose(each, 0.95, atol=0.04)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("points", "wrong"), [(8, 0), (12, 1), (16, 2), (24, 3)])
+def test_the_promise_is_kept(points, wrong):
+    """The share of regions that hold where as many points are rejected as are wrong,
+    promised from single pairs, against the share counted over many with known truth."""
+    procedure, largest, count = rejection.DataSnooping(), 0.1, 3000
+    rng = np.random.default_rng(points)
+    pairs = measured(count, points)
+    place = np.argsort(rng.random((count, points)), axis=1) < wrong
+    sizes = largest * rng.uniform(0.5, 1, (2, count, points)) * place
+    x_right, y_right = sizes * rng.choice([-1, 1], sizes.shape)
+    pairs = jax.vmap(lambda p, x, y: mock_pairs.plant(p, x_right=x, y_right=y))(
+        pairs, jnp.asarray(x_right), jnp.asarray(y_right)
+    )
+    found = jaxro.clean_batch(pairs, procedure)
+    photos, truth = found.orientation, jaxro.to_pose(TRUE)
+    off = np.stack(jax.vmap(lambda pose: difference(truth, pose))(photos.pose), axis=1)
+    decided = np.sum(~np.asarray(found.mask), axis=1) == wrong
+    good = np.asarray(photos.usable & (photos.degrees_of_freedom > 0)) & decided
+    cofactor = np.asarray(photos.cofactor)[good]
+    squared = np.einsum("ki,kij,kj->k", off[good], np.linalg.inv(cofactor), off[good])
+    counted = np.mean(squared <= scipy.stats.chi2.ppf(0.95, 5))
+    each = []
+    for k in np.flatnonzero(good)[:6]:
+        pair, rejected = jax.tree.map(lambda a, k=k: a[k], (pairs, found))
+        key = jax.random.key(k)
+        told = jaxro.after_cleaning(pair, rejected, procedure, key, largest=largest)
+        each.append(float(told.coverage_known))
+    assert np.mean(each) == pytest.approx(counted, abs=0.02)

@@ -370,3 +370,32 @@ def test_points_that_nothing_tells_apart_are_named(tmp_path):
         ["a", "b", "e", "f"],
         [],
     )
+
+
+@pytest.mark.slow
+def test_the_promise_of_the_intervals_is_told(sample):
+    """Of an error that is always found they hold what they say, in words and in the
+    JSON."""
+    how = [
+        *FOCAL,
+        "--procedure",
+        "data-snooping",
+        "--promise",
+        "300",
+    ]
+    result = run(sample, *how, "--json")
+    assert result.exit_code == 0, result.stderr
+    (only,) = json.loads(result.stdout)["orientation"]["pairs"]
+    told = only["promise"]
+    assert told["repetitions"] == 300 and told["confidence"] == 0.95
+    assert set(told["intervals"]) == set(only["elements"])
+    assert told["exactly_right"] > 0.9 and 0.9 < told["region"] < 0.99
+    assert all(0.88 < share <= 1 for share in told["intervals"].values())
+    assert "In 300 simulated pairs like this one" in words(run(sample, *how).stdout)
+
+
+def test_a_promise_needs_repetitions_and_a_table_at_once(sample):
+    few = run(sample, *FOCAL, "--promise", "5")
+    assert few.exit_code == 2 and "--promise" in words(few.stderr)
+    parts = run(sample, *FOCAL, "--promise", "100", "--parquet", "--out", "never")
+    assert parts.exit_code == 2 and "has no --promise" in words(parts.stderr)

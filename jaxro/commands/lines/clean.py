@@ -31,6 +31,16 @@ def clean(
             show_default=False,
         ),
     ] = None,
+    promise: Annotated[
+        int | None,
+        typer.Option(
+            min=100,
+            help="Simulate so many pairs like each one and clean them, too: how often "
+            "the intervals then hold the truth. 1000 tells it to 1 %.",
+            metavar="N",
+            show_default=False,
+        ),
+    ] = None,
     camera: given.Camera = None,
     focal: given.Focal = None,
     principal_point: given.PrincipalPoint = None,
@@ -82,7 +92,12 @@ def clean(
     if given.large(file, parquet, resume, tables, engine):
         from .. import large
 
+        if promise is not None:
+            raise typer.BadParameter(
+                "a table that is worked on in parts has no --promise: give it a smaller "
+                "one, of some of its pairs"
+            )
         how = large.Large(tables, resume, engine=given.engine_of(engine))
         end(lambda: large.run(options, how, choose_procedure(name, changes)))
     else:
-        end(lambda: run(options, name, changes))
+        end(lambda: run(options, name, changes, promise))
