@@ -27,9 +27,9 @@ from ..adjustment import critical_values, normal_equations as normal
 from ..geometry import coplanarity
 from ..geometry.elements import AbstractElements
 from ..geometry.pairs import Pair, mask_unusable
-from ..orientation.degeneracy import direction_of_worst
+from ..orientation.degeneracy import bend, direction_of_worst
 from ..orientation.result import Orientation
-from ..xla.passes import total
+from ..xla.passes import sums, total
 from ..xla.programs import compiled
 from .sensitivity import displacement
 
@@ -63,7 +63,8 @@ def curvature(
     pair: Pair, orientation: Orientation, *, sigma0: ArrayLike | None = None
 ) -> Number:
     """How far S departs from its parabola two standard deviations along the worst
-    determined direction: |rise of S / (4 s²) - 1|, on the side where that is more.
+    determined direction: |rise of S / rise of the parabola - 1|, on the side where that
+    is more.
 
     Zero for a linear adjustment; from `CURVED` on `interval` tells what deviations do
     not. `sigma0`: the standard deviation of unit weight where it is known (1 where the
@@ -71,16 +72,36 @@ def curvature(
     pair; works under jit and vmap.
     """
     pair, centre = mask_unusable(pair)[0], orientation.elements
-    residuals = coplanarity.residuals(pair, centre)
-    direction, _ = direction_of_worst(centre, orientation.cofactor)
-    along = lambda t: residuals(tuple(t * e for e in direction))
-    zero = jnp.zeros_like(orientation.sigma0)
-    r, slope = jax.jvp(along, (zero,), (jnp.ones_like(zero),))
-    unit = _unit(orientation, sigma0)
-    twice = 2 * unit / jnp.sqrt(total(slope**2))
+    direction, variance = direction_of_worst(centre, orientation.cofactor)
+    away = 2 * _unit(orientation, sigma0) * jnp.sqrt(variance)
+    at, slope, _ = bend(pair, centre, direction)
+    ahead, behind = (
+        coplanarity.fundamental_matrix(
+            *centre.move(tuple(t * e for e in direction)).relative(),
+            pair.focal_left,
+            pair.focal_right,
+        )
+        for t in (away, -away)
+    )
+
+    def of_point(point, sigma, use, roots):
+        line = lambda f: coplanarity.linearise(f, point, use, roots)
+        g, square, b = line(at)
+        h, _, turned = line(slope)
+        # r' of r = g / |B|
+        h = h - g * sum(x * y for x, y in zip(b, turned, strict=True)) / square
+        rises = [g**2 / square for g, square, _ in map(line, (ahead, behind))]
+        squares = g**2 / square, g * h / square, h**2 / square, *rises
+        return tuple(jnp.where(use, entry / sigma**2, 0.0) for entry in squares)
+
+    measured = pair.coordinates, pair.sigma, pair.mask, pair.roots
+    here, falls, bends, *there = sums(jax.vmap(of_point)(*measured))
     # but for its slope, which is zero in the minimum of S: weights that fade have another
-    rises = [total(along(t) ** 2 - r**2 - 2 * t * r * slope) for t in (twice, -twice)]
-    return jnp.maximum(*(jnp.abs(rise / (4 * unit**2) - 1) for rise in rises))
+    parabola = bends * away**2
+    rises = [
+        s - here - 2 * t * falls for s, t in zip(there, (away, -away), strict=True)
+    ]
+    return jnp.maximum(*(jnp.abs(rise / parabola - 1) for rise in rises))
 
 
 def region_holds(

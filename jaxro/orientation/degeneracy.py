@@ -96,7 +96,7 @@ def worst_direction(
     the first know nothing of.
     """
     direction, variance = direction_of_worst(elements, cofactor)
-    matrices = _bend(pair, elements, direction)
+    matrices = bend(pair, elements, direction)
     bent = _sum_along(pair, *matrices, variance * sigma0**2)
 
     columns = _along_columns(pair, elements, bent.by_entry)  # Aᵀc
@@ -125,7 +125,7 @@ def margin_along(
 ) -> Float[Array, ""]:
     """The `margin` of `WorstDirection`, along any direction of the elements with this
     variance."""
-    f, slope, _ = _bend(pair, elements, direction)
+    f, slope, _ = bend(pair, elements, direction)
 
     def of_point(point, sigma, use, roots):
         _, square, _ = coplanarity.linearise(f, point, use, roots)
@@ -180,7 +180,7 @@ def direction_of_worst(
     return [e * unit for e, unit in zip(direction, units, strict=True)], variance
 
 
-def _bend(pair: Pair, elements: AbstractElements, direction: list) -> tuple:
+def bend(pair: Pair, elements: AbstractElements, direction: list) -> tuple:
     """F and its first and second derivative along a direction of the elements.
 
     F is linear in R and in b; of a steady turn R'' = R' Rᵀ R', of a steady shift
