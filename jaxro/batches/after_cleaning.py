@@ -34,12 +34,15 @@ class AfterCleaning(NamedTuple):
 
     `answered`: cleaned, with a usable orientation. Of those: `exactly_right`: just the
     wrong points rejected; `without_wrong`: no wrong point kept; `alike`: as many points
-    rejected as of the pair itself. Of the ones alike, which had the same decision, and
-    NaN if there are none: `coverage`: the true pose in the region promised at the `confidence`, a
-    posteriori; `coverage_known`: a priori, by the given sigma. `intervals`, and
-    `intervals_known`: the same of the interval of each element alone. `inflation`: root
-    mean square of the pose's errors over the promised ones (1 where they are honest). A
-    share p has the standard deviation sqrt(p (1 - p) / repetitions).
+    rejected as of the pair itself.
+
+    Of those alike, after the same decision, that is (NaN where there are none):
+    `coverage`: the true pose in the region promised at the `confidence`, a posteriori;
+    `coverage_known`: a priori, by the given sigma; `intervals` and `intervals_known`:
+    the same of the interval of each element; `inflation`: root mean square of the pose's
+    errors over the promised ones (1 where they are honest).
+
+    A share p of n pairs has the standard deviation sqrt(p (1 - p) / n).
     """
 
     answered: Float[Array, ""]
