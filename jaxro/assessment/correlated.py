@@ -16,9 +16,10 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..adjustment import normal_equations as normal
+from ..geometry.elements import AbstractElements
 from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Coordinates, Pair, mask_unusable
 from ..orientation.orient import Orientation
@@ -48,24 +49,37 @@ def correlated_covariance(
     `rho` in 0 to 1; `length` l in the unit of the coordinates, as `pattern` estimates
     them. The pair must be oriented with rigorous residuals. Works under jit and vmap.
     """
+    q, grown, divided = _correlate(
+        pair, orientation.elements, orientation.degrees_of_freedom, rho, length
+    )
+    independent = orientation.sigma0**2
+    ratio = jnp.diagonal(grown) / jnp.diagonal(q)
+    return Correlated(
+        covariance=independent * grown,
+        growth=jnp.sqrt(ratio),
+        sigma0=jnp.sqrt(independent * divided),
+    )
+
+
+def _correlate(
+    pair: Pair,
+    elements: AbstractElements,
+    freedom: Int[Array, ""],
+    rho: ArrayLike,
+    length: ArrayLike,
+) -> tuple[Float[Array, "5 5"], Float[Array, "5 5"], Float[Array, ""]]:
+    """Q; C / sigma0², its growth; and s² / sigma0²."""
     pair = mask_unusable(pair)[0]
-    linear = linearise(pair, orientation.elements)
-    inverse, _ = normal.inverse(linear.normal_equations()[0])
-    q = normal.dense(inverse)
+    linear = linearise(pair, elements)
+    q = normal.dense(normal.inverse(linear.normal_equations()[0])[0])
     rho, length = (jnp.asarray(x, q.dtype) for x in (rho, length))
     middle = rho * _agreeing(linear, pair.coordinates, length)
 
     # tr(R K) = -tr(H K), as the diagonal of K is zero
-    freedom = orientation.degrees_of_freedom.astype(q.dtype)
-    left = freedom - jnp.sum(q * middle)
-    independent = orientation.sigma0**2
-    variance = independent * freedom / jnp.where(left > 0, left, freedom)
-
-    covariance = variance * (q + q @ middle @ q)
-    ratio = jnp.diagonal(covariance) / (independent * jnp.diagonal(q))
-    return Correlated(
-        covariance=covariance, growth=jnp.sqrt(ratio), sigma0=jnp.sqrt(variance)
-    )
+    f = freedom.astype(q.dtype)
+    left = f - jnp.sum(q * middle)
+    divided = f / jnp.where(left > 0, left, f)
+    return q, divided * (q + q @ middle @ q), divided
 
 
 def _agreeing(
@@ -95,6 +109,24 @@ def _agreeing(
 
 
 @jax.jit
+def grown_cofactor(
+    pair: Pair,
+    elements: AbstractElements,
+    cofactor: Float[Array, "5 5"],
+    freedom: Int[Array, ""],
+    rho: ArrayLike,
+    length: ArrayLike,
+) -> Float[Array, "5 5"]:
+    """The cofactors of the elements of one oriented pair under correlated errors, from
+    those that it has; `freedom`: its degrees of freedom. Those that are not of least
+    squares grow as these do. Works under jit and vmap."""
+    q, grown, _ = _correlate(pair, elements, freedom, rho, length)
+    plain = _factor(q)
+    own = [[*row[:-1], 1 / row[-1]] for row in _factor(cofactor)]
+    turn = _dense(own) @ _dense(normal.inverse_of_lower(plain))
+    return turn @ grown @ turn.T
+
+
 def allow_for_neighbours(
     pair: Pair, orientation: Orientation, rho: ArrayLike, length: ArrayLike
 ) -> Orientation:
@@ -102,18 +134,12 @@ def allow_for_neighbours(
     errors; everything that follows from them holds then: deviations, intervals,
     regions. sigma0 is left as it is, the size of the residuals.
 
-    `rho` and `length`: of the pair, or of a table, by `pattern` and `pool`. Cofactors
-    that are not those of least squares grow as these do. Works under jit and vmap.
+    `rho` and `length`: of the pair, or of a table, by `pattern` and `pool`. Works under
+    jit and vmap.
     """
-    correlated = correlated_covariance(pair, orientation, rho, length)
-    linear = linearise(mask_unusable(pair)[0], orientation.elements)
-    inverse, _ = normal.inverse(linear.normal_equations()[0])
-    plain = _factor(normal.dense(inverse))
-    own = [[*row[:-1], 1 / row[-1]] for row in _factor(orientation.cofactor)]
-    # the growth of one is that of the other
-    turn = _dense(own) @ _dense(normal.inverse_of_lower(plain))
-    grown = correlated.covariance / orientation.sigma0**2
-    return dataclasses.replace(orientation, cofactor=turn @ grown @ turn.T)
+    asked = orientation.elements, orientation.cofactor, orientation.degrees_of_freedom
+    grown = grown_cofactor(pair, *asked, rho, length)
+    return dataclasses.replace(orientation, cofactor=grown)
 
 
 def _factor(q: Float[Array, "5 5"]) -> normal.Lower:

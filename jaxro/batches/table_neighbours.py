@@ -10,22 +10,26 @@ agree hold a half of what they promise, or less, where errors are taken as indep
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..assessment import Pattern, neighbours
-from ..assessment.correlated import allow_for_neighbours
-from ..geometry.elements import RelativePose
+from ..assessment.correlated import grown_cofactor
+from ..geometry.elements import AbstractElements, RelativePose
 from ..geometry.linear import Linear, linearise
 from ..geometry.pairs import Coordinates, Pair, mask_unusable
 from ..orientation.result import Orientation
 from ..xla.programs import compiled
 from ..xla.settings import MOMENT, settings_for
 from .batch import map_batch
-from .buckets import choose
-from .padding import sizes
+from .buckets import by_size, choose
+from .padding import plan_for, sizes
 from .ragged import Ragged
+
+AT_ONCE = 1 << 16
+"""Points of the pairs that are worked on together."""
 
 PAIRS, POINTS = 100, 200
 """Pairs of a table whose residuals are looked at, at most, and points of each: of more,
@@ -81,12 +85,57 @@ def pool(patterns: dict[int, Pattern]) -> Pattern | None:
     return neighbours.pool(jax.tree.map(lambda *a: np.stack(a), *each))
 
 
-class Agreeing(NamedTuple):
-    """A pair, its orientation, and by how much and how far neighbours agree; batches of
-    them have leading axes."""
+def allow(
+    pairs: Pair | Ragged, orientations: Orientation
+) -> tuple[Orientation, Pattern | None]:
+    """The orientations of a batch, (pair, point), or of pairs of any lengths, with the
+    deviations that they have where neighbours agree, and what all pairs together tell
+    of that.
+
+    Where their test finds nothing (`Pattern.flagged`) the orientations are returned as
+    they are. Of cleaned pairs give those with the mask of the points that were kept,
+    `pairs.with_mask(rejections.mask)`. The pairs must be oriented with rigorous
+    residuals.
+    """
+    found = jax.tree.map(np.asarray, orientations)
+    ragged = pairs if isinstance(pairs, Ragged) else _one_behind_the_other(pairs)
+    poses = np.stack(jax.tree.leaves(found.pose), axis=-1)
+    tells = np.asarray(found.usable) & (found.degrees_of_freedom >= 2)
+    pattern = pool(find(ragged, poses, tells))
+    if pattern is None or not pattern.flagged:
+        return orientations, pattern
+    asked = found.elements, found.cofactor, found.degrees_of_freedom
+    grown = grow(ragged, *asked, pattern)
+    return eqx.tree_at(lambda o: o.cofactor, orientations, grown), pattern
+
+
+def grow(
+    pairs: Ragged,
+    elements: AbstractElements,
+    cofactor: Float[np.ndarray, "pair 5 5"],
+    freedom: Int[np.ndarray, " pair"],
+    pattern: Pattern,
+) -> Float[np.ndarray, "pair 5 5"]:
+    """The cofactors of the elements of oriented pairs where neighbours agree as this
+    pattern says; `freedom`: their degrees of freedom."""
+    told = (np.full(len(freedom), float(x)) for x in (pattern.rho, pattern.length))
+    of_pairs = (elements, cofactor, freedom, *told)
+    grown = np.array(cofactor)
+    most = lambda size: max(1, AT_ONCE // size)
+    for members, size in by_size(pairs, plan_for(pairs.lengths), most):
+        own = jax.tree.map(lambda a, members=members: np.asarray(a)[members], of_pairs)
+        agreeing = _Agreeing(pairs.pad_to(members, size), *own)
+        grown[members] = np.asarray(map_batch(_grow, agreeing))
+    return grown
+
+
+class _Agreeing(NamedTuple):
+    """What `grown_cofactor` takes, of one pair or of a batch."""
 
     pair: Pair
-    orientation: Orientation
+    elements: AbstractElements
+    cofactor: Float[Any, "*pairs 5 5"]
+    freedom: Int[Any, "*pairs"]
     rho: Float[Any, "*pairs"]
     length: Float[Any, "*pairs"]
 
@@ -96,31 +145,13 @@ class Agreeing(NamedTuple):
         return self.pair.x_left
 
 
-def allow(
-    pairs: Pair, orientations: Orientation, threads: int | None = None
-) -> tuple[Orientation, Pattern | None]:
-    """The orientations of a batch, (pair, point), with the deviations that they have
-    where neighbours agree, and what all pairs together tell of that.
+def _grow(agreeing: _Agreeing) -> Float[Array, "5 5"]:
+    return grown_cofactor(*agreeing)
 
-    Where their test finds nothing (`Pattern.flagged`) the orientations are returned as
-    they are. Of cleaned pairs give those with the mask of the points that were kept,
-    `pairs.with_mask(rejections.mask)`. The pairs must be oriented with rigorous
-    residuals.
-    """
-    host, found = jax.tree.map(np.asarray, (pairs, orientations))
-    count, points = host.x_left.shape
-    flat = jax.tree.map(lambda a: a.reshape(-1), host)
+
+def _one_behind_the_other(pairs: Pair) -> Ragged:
+    """A batch, (pair, point)."""
+    count, points = pairs.x_left.shape
+    flat = jax.tree.map(lambda a: np.asarray(a).reshape(-1), pairs)
     columns = [getattr(flat, name) for name in Ragged._fields if name != "begins"]
-    ragged = Ragged(np.arange(count + 1) * points, *columns)
-    poses = np.stack(jax.tree.leaves(found.pose), axis=-1)
-    tells = np.asarray(found.usable) & (found.degrees_of_freedom >= 2)
-    pattern = pool(find(ragged, poses, tells))
-    if pattern is None or not pattern.flagged:
-        return orientations, pattern
-    told = (np.full(count, float(x)) for x in (pattern.rho, pattern.length))
-    agreeing = Agreeing(pairs, orientations, *told)
-    return map_batch(_allow, agreeing, threads=threads), pattern
-
-
-def _allow(agreeing: Agreeing) -> Orientation:
-    return allow_for_neighbours(*agreeing)
+    return Ragged(np.arange(count + 1) * points, *columns)

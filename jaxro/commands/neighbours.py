@@ -4,18 +4,20 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..assessment import Pattern
-from ..batches.batch import map_batch
-from ..batches.buckets import by_size
-from ..batches.padding import plan_for
+from ..batches import table_neighbours
 from ..batches.ragged import Ragged
-from ..geometry.elements import AbstractElements, DependentElements
-from ..reports.columns import is_given
-from ..reports.reader import Agreeing, Correlator
-
-AT_ONCE = 1 << 16
-"""Points of the pairs that are worked on together."""
+from ..geometry.elements import (
+    AbstractElements,
+    DependentElements,
+    RelativePose,
+    convert,
+)
+from ..reports.columns import element_names, is_given
+from ..reports.reader import report_all
+from ..xla.programs import compiled
 
 
 def allow(
@@ -33,26 +35,27 @@ def allow(
     base = (
         of_pairs["bx"] if system is DependentElements else np.ones(len(pairs.lengths))
     )
-    correlate = Correlator(system)
-    changed: dict[str, Any] = {}
-    most = lambda size: max(1, AT_ONCE // size)
-    for members, size in by_size(pairs, plan_for(pairs.lengths), most):
-        here = lambda column, members=members: np.asarray(column)[members]
-        agreeing = Agreeing(
-            pair=pairs.pad_to(members, size),
-            pose=here(of_pairs["pose"]),
-            base=here(base),
-            cofactor=here(of_pairs["cofactor"]),
-            sigma0=here(of_pairs["sigma0"]),
-            degrees_of_freedom=here(of_pairs["degrees_of_freedom"]),
-            rho=np.full(len(members), float(pattern.rho)),
-            length=np.full(len(members), float(pattern.length)),
-        )
-        found = jax.tree.map(np.asarray, map_batch(correlate, agreeing))
-        for name, values in found.items():
-            column = changed.setdefault(name, np.array(of_pairs[name]))
-            column[members] = values
-    names = [n for n in changed if n.startswith("sd_") and not is_given(n[3:], system)]
-    growth = np.stack([changed[name] / of_pairs[name] for name in names])
+    elements = _elements(of_pairs["pose"], base, system=system)
+    asked = elements, of_pairs["cofactor"], of_pairs["degrees_of_freedom"]
+    cofactor = table_neighbours.grow(pairs, *asked, pattern)
+    _, deviations = report_all(elements, cofactor, of_pairs["sigma0"])
+    told = zip(element_names(system), map(np.asarray, deviations), strict=True)
+    changed = {f"sd_{name}": sd for name, sd in told if not is_given(name, system)}
+    growth = np.stack([sd / of_pairs[name] for name, sd in changed.items()])
+    roots = np.sqrt(np.diagonal(cofactor, axis1=1, axis2=2))
+    correlation = cofactor / (roots[:, :, None] * roots[:, None, :])
+    changed |= {"cofactor": cofactor, "correlation": correlation}
     there = growth[np.isfinite(growth)]
     return of_pairs | changed, float(np.median(there)) if there.size else None
+
+
+@compiled
+def _elements(
+    poses: Float[Array, "pair 7"],
+    base: Float[Array, " pair"],
+    *,
+    system: type[AbstractElements],
+) -> AbstractElements:
+    """The elements of the poses in a system."""
+    of_one = lambda pose, base: convert(RelativePose(*pose), system, base)
+    return jax.vmap(of_one)(poses, base)

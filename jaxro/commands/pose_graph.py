@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from ..batches import table_neighbours
 from ..batches.ragged import Ragged, orient_ragged
 from ..exchange.pose_graph import UNKNOWN, g2o_text, pose_graph
 from ..exchange.scales import base_lengths
+from ..geometry import coplanarity
 from ..geometry.elements import RelativePose
 from ..tables import whole
 from ..tables.cameras import Cameras
@@ -36,6 +38,8 @@ def graph_text(
     points = list(map(str, to_list(table.points)))
     sigma0 = 1.0 if sigma_known else None
     oriented = orient_ragged(pairs, elements=RelativePose, **options)
+    if options.get("residual", coplanarity.rigorous) is coplanarity.rigorous:
+        oriented, _ = table_neighbours.allow(pairs, oriented)
     known = base_lengths(left, right, pairs, points, oriented, sigma0=sigma0)
     joined = np.isfinite(known.deviation)
     # every reader takes a matrix that is positive definite

@@ -19,8 +19,7 @@ import numpy as np
 from ..orientation.result import Orientation
 from ..reports.columns import Column, Units, columns_of, element_names, is_given
 from ..reports.model import Results
-from ..reports.reader import report_elements
-from ..xla.programs import compiled
+from ..reports.reader import report_all
 
 NO_NAMES = Units(photo="", model="", sigma0="")
 """The units of an orientation, which does not know what they are called."""
@@ -68,7 +67,7 @@ def _pair_values(oriented: Orientation) -> dict[str, Any]:
     axes = np.ndim(oriented.usable)
     flat = lambda a: np.reshape(np.asarray(a), (-1, *np.shape(a)[axes:]))
     data = jax.tree.map(flat, (oriented.elements, oriented.cofactor, oriented.sigma0))
-    found, deviations = _report(*data)
+    found, deviations = report_all(*data)
     usable, system = flat(oriented.usable), type(oriented.elements)
     hide = lambda a: np.where(usable, np.ravel(a), np.nan)
     values: dict[str, Any] = {
@@ -83,12 +82,6 @@ def _pair_values(oriented: Orientation) -> dict[str, Any]:
         if not is_given(name, system):
             values[f"sd_{name}"] = hide(sd)
     return values
-
-
-@compiled
-def _report(*columns: Any) -> tuple[list, list]:
-    """The reported numbers of all pairs and their deviations."""
-    return jax.vmap(report_elements)(*columns)
 
 
 def _of_files(table: str, result: Any) -> Any:

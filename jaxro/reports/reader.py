@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment.guarded import root
-from ..assessment.correlated import allow_for_neighbours
 from ..assessment.likelihood import curvature
 from ..assessment.reliability import Reliability, assess, controllability
 from ..geometry import coplanarity, rotations as rot
@@ -24,6 +23,7 @@ from ..geometry.elements import (
 from ..geometry.pairs import Coordinates, Pair
 from ..orientation.orient import Orientation
 from ..orientation.results import RESULTS
+from ..xla.programs import compiled
 from .columns import columns_of
 
 Columns = dict[str, Array]
@@ -57,62 +57,6 @@ class Reader(NamedTuple):
         return read("elements"), {table: read(table) for table in of_points}
 
 
-class Agreeing(NamedTuple):
-    """A pair with the columns of its orientation that its deviations depend on, and by
-    how much and how far the errors of neighbours agree; batches have leading axes."""
-
-    pair: Pair
-    pose: Float[Any, "*pairs 7"]
-    base: Float[Any, "*pairs"]
-    cofactor: Float[Any, "*pairs 5 5"]
-    sigma0: Float[Any, "*pairs"]
-    degrees_of_freedom: Int[Any, "*pairs"]
-    rho: Float[Any, "*pairs"]
-    length: Float[Any, "*pairs"]
-
-    @property
-    def x_left(self) -> Float[Any, "*pairs point"]:
-        """Of the pair, by which batches are split."""
-        return self.pair.x_left
-
-
-class Correlator(NamedTuple):
-    """correlate(agreeing) -> the columns of the pair that change where neighbours agree:
-    the deviations of its elements, and their correlations."""
-
-    system: type[AbstractElements]
-
-    def __call__(self, agreeing: Agreeing) -> Columns:
-        """The columns by name."""
-        independent = orientation_of(
-            agreeing.pair,
-            RelativePose(*agreeing.pose),
-            self.system,
-            agreeing.base,
-            usable=jnp.ones_like(agreeing.degrees_of_freedom, bool),
-            degrees_of_freedom=agreeing.degrees_of_freedom,
-            cofactor=agreeing.cofactor,
-            sigma0=agreeing.sigma0,
-        )
-        told = Told(
-            agreeing.pair,
-            allow_for_neighbours(
-                agreeing.pair, independent, agreeing.rho, agreeing.length
-            ),
-        )
-        columns = columns_of("elements", self.system)
-        return {
-            c.name: jnp.asarray(c.of(told))
-            for c in columns
-            if c.of is not None and is_of_deviations(c.name)
-        }
-
-
-def is_of_deviations(column: str) -> bool:
-    """Whether the column tells how accurate the elements are."""
-    return column == "correlation" or column.startswith("sd_")
-
-
 class Oriented(NamedTuple):
     """A pair with what its reliability depends on of the columns that are read of its
     orientation; batches of them have leading axes. `z`: model heights, where they
@@ -143,51 +87,26 @@ class Assessor(NamedTuple):
 
     def __call__(self, oriented: Oriented) -> Columns:
         """The columns by name."""
-        pair = oriented.pair
-        orientation = orientation_of(
-            pair,
-            RelativePose(*oriented.pose),
-            self.system,
-            oriented.base,
-            usable=oriented.usable,
+        pair, pose = oriented.pair, RelativePose(*oriented.pose)
+        nothing, none = jnp.zeros_like(pair.x_left), jnp.zeros_like(oriented.base)
+        orientation = Orientation(
+            pose=pose,
+            elements=convert(pose, self.system, oriented.base),
+            cofactor=jnp.zeros((5, 5)),
+            parallax=nothing,
+            residuals=nothing,
+            redundancy=nothing,
+            model=(nothing, nothing, oriented.z),
+            in_front=pair.mask,
+            m_q=none,
+            sigma0=none,
             degrees_of_freedom=oriented.degrees_of_freedom,
-            z=oriented.z,
+            iterations=oriented.degrees_of_freedom,
+            result=RESULTS.where(oriented.usable, RESULTS.successful, RESULTS.diverged),  # pyright: ignore[reportArgumentType]
         )
         return _read(
             "reliability", Told(pair, orientation, sigma_known=self.sigma_known)
         )
-
-
-def orientation_of(
-    pair: Pair,
-    pose: RelativePose,
-    system: type[AbstractElements],
-    base: Array,
-    *,
-    usable: Array,
-    degrees_of_freedom: Array,
-    z: Array | None = None,
-    cofactor: Array | None = None,
-    sigma0: Array | None = None,
-) -> Orientation:
-    """The orientation of a pair as far as its columns tell it: nothing of its points
-    but, where they are given, their heights `z`."""
-    nothing, none = jnp.zeros_like(pair.x_left), jnp.zeros_like(base)
-    return Orientation(
-        pose=pose,
-        elements=convert(pose, system, base),
-        cofactor=jnp.zeros((5, 5)) if cofactor is None else cofactor,
-        parallax=nothing,
-        residuals=nothing,
-        redundancy=nothing,
-        model=(nothing, nothing, nothing if z is None else z),
-        in_front=pair.mask,
-        m_q=none,
-        sigma0=none if sigma0 is None else sigma0,
-        degrees_of_freedom=degrees_of_freedom,
-        iterations=degrees_of_freedom,
-        result=RESULTS.where(usable, RESULTS.successful, RESULTS.diverged),  # pyright: ignore[reportArgumentType]
-    )
 
 
 def _read(table: str, told: "Told") -> Columns:
@@ -214,6 +133,14 @@ def report_elements(
     products = jacobian[:, :, None] * jacobian[:, None, :] * cofactor[None]
     deviations = sigma0 * root(jnp.sum(products, axis=(1, 2)))
     return _in_degrees(values(*origin), angles), _in_degrees(list(deviations), angles)
+
+
+@compiled
+def report_all(
+    elements: AbstractElements, cofactor: Array, sigma0: Array
+) -> tuple[list[Array], list[Array]]:
+    """`report_elements` of many pairs."""
+    return jax.vmap(report_elements)(elements, cofactor, sigma0)
 
 
 def report_numbers(centre: AbstractElements, elements: AbstractElements) -> Array:
