@@ -55,6 +55,10 @@ the area of the points."""
 LEVEL = 0.05
 """Probability below which a pattern is reported."""
 
+SURE = 0.001
+"""Probability below which deviations allow for a pattern: of a thousand tables of
+independent errors one."""
+
 NEAR = 1e-6
 """tr A² below which no two points are near each other at the length of the kernel."""
 
@@ -97,6 +101,11 @@ class Pattern(eqx.Module):
         """Whether independent errors would show such a pattern in less than 5 % of all
         cases."""
         return self.probability < LEVEL
+
+    @property
+    def sure(self) -> Any:
+        """Whether it is so sure that deviations are to allow for it."""
+        return self.probability < SURE
 
 
 @jax.jit

@@ -92,7 +92,7 @@ def allow(
     deviations that they have where neighbours agree, and what all pairs together tell
     of that.
 
-    Where their test finds nothing (`Pattern.flagged`) the orientations are returned as
+    Where their test is not sure of it (`Pattern.sure`) the orientations are returned as
     they are. Of cleaned pairs give those with the mask of the points that were kept,
     `pairs.with_mask(rejections.mask)`. The pairs must be oriented with rigorous
     residuals.
@@ -102,7 +102,7 @@ def allow(
     poses = np.stack(jax.tree.leaves(found.pose), axis=-1)
     tells = np.asarray(found.usable) & (found.degrees_of_freedom >= 2)
     pattern = pool(find(ragged, poses, tells))
-    if pattern is None or not pattern.flagged:
+    if pattern is None or not pattern.sure:
         return orientations, pattern
     asked = found.elements, found.cofactor, found.degrees_of_freedom
     grown = grow(ragged, *asked, pattern)

@@ -28,8 +28,8 @@ def allow(
 ) -> tuple[dict[str, Any], float | None]:
     """The columns of the pairs with the deviations that they have where neighbours agree
     as this `pattern` of the table says, and by how much these have grown, in the median;
-    the columns as they are, and None, where its test finds nothing."""
-    if pattern is None or not pattern.flagged:
+    the columns as they are, and None, where its test is not sure of it."""
+    if pattern is None or not pattern.sure:
         return of_pairs, None
     # of dependent elements the base is given
     base = (

@@ -181,7 +181,7 @@ def _neighbours(results: Results) -> list[str]:
         f"{number(length, digits(length, 0))} {units.photo} (probability {chance:.1g})"
     )
     if results.growth is None:
-        return [f"{said}: the standard deviations are too small."]
+        return [f"{said}: if that is no chance, the standard deviations are too small."]
     larger = number(results.growth, digits(results.growth, 1))
     return [
         f"{said}: the standard deviations allow for it, and are {larger} times those of "

@@ -287,7 +287,7 @@ def test_a_table_tells_the_deviations_of_its_pairs():
     cofactors twice as large grow as these do."""
     pairs, found, truth = table(40, 150, 0.5, 0.1 * PHOTO)
     allowed, together = table_neighbours.allow(pairs, found)
-    assert together.flagged
+    assert together.sure
     np.testing.assert_allclose(together.rho, 0.5, atol=0.1)
     np.testing.assert_allclose(together.length, 0.1 * PHOTO, rtol=0.2)
     assert hold(found, truth) < 0.85 and 0.9 < hold(allowed, truth) < 0.99
@@ -302,7 +302,7 @@ def test_a_table_tells_the_deviations_of_its_pairs():
 
     pairs, found, _ = table(40, 150, 0.0, 1.0)
     same, together = table_neighbours.allow(pairs, found)
-    assert not together.flagged and same is found
+    assert not together.sure and same is found
 
 
 @pytest.mark.slow
