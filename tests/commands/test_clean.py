@@ -327,9 +327,10 @@ def test_every_outcome_has_a_name_and_advice():
 def test_points_that_nothing_tells_apart_are_named(tmp_path):
     """An error in one of four points that stand alone in their zones: in the report,
     the tables and the summary."""
-    flat = mock_pairs.plant(
-        mock_pairs.mock_pair(mock_pairs.standard_layout(8)), y_right=np.eye(8)[0] * 0.4
-    )
+    layout = mock_pairs.standard_layout(8)
+    # the last two beside the third and the fourth, not at their places
+    layout = layout._replace(x=(*layout.x[:6], 0.05, 0.95))
+    flat = mock_pairs.plant(mock_pairs.mock_pair(layout), y_right=np.eye(8)[0] * 0.4)
     columns = np.stack([np.asarray(c) for c in flat.coordinates], axis=-1)
     lines = [
         f"{name},{','.join(map(repr, map(float, row)))}"
