@@ -156,25 +156,48 @@ def _unit(orientation: Orientation, sigma0: ArrayLike | None) -> Number:
     return own if sigma0 is None else jnp.asarray(sigma0, own.dtype)
 
 
+@compiled
+def ends(
+    pair: Pair, centre: AbstractElements, limit: Number, *, quantity: Quantity
+) -> Interval:
+    """The least and the largest values of numbers of the elements where S is above its
+    minimum, in `centre`, by the limit."""
+    residuals = coplanarity.residuals(mask_unusable(pair)[0], centre)
+    white = lambda x: residuals(tuple(x))
+    number = lambda x: quantity(centre, centre.move(x).normalise())
+    origin = jnp.zeros(centre.count)
+
+    def end(which: Int[Array, ""], sign: Number) -> Number:
+        return _End(white, lambda x: number(x)[which], origin, limit, sign).find()
+
+    numbers = jnp.arange(jax.eval_shape(number, origin).size)
+    find = jax.vmap(end, in_axes=(0, None))
+    return Interval(find(numbers, jnp.asarray(-1.0)), find(numbers, jnp.asarray(1.0)))
+
+
 class _Way(NamedTuple):
-    """A place on the way to an end of an interval, the value there, and its `merit`:
-    the value, less what S is above the limit; `longest`: the step that may follow, in
-    widths of the region by the covariance; `arrived`; `left`: steps that may follow."""
+    """A place on the way to an end, and its merit; `longest`: the step that may follow,
+    in widths of the region by the covariance; `arrived`; `left`: steps that may
+    follow."""
 
     x: Float[Array, "5"]
-    value: Number
     merit: Number
     longest: Number
     arrived: Bool[Array, ""]
     left: Int[Array, ""]
 
 
-@compiled
-def ends(
-    pair: Pair, centre: AbstractElements, limit: Number, *, quantity: Quantity
-) -> Interval:
-    """The least and the largest values of numbers of the elements where S is above its
-    minimum, in `centre`, by the limit.
+class _Step(NamedTuple):
+    """A step, its length for sigma0 = 1, and the variance of h where it begins."""
+
+    x: Float[Array, "5"]
+    length: Number
+    variance: Number
+
+
+class _End(NamedTuple):
+    """The end of h = `value(x)` in the direction of `sign` where S, the squares of
+    `white(x)`, is above its minimum at the `origin` by the limit.
 
     At x, with the residuals r, their columns A, N = AᵀA and the slope a of h, S changes
     by 2 gᵀd + dᵀNd with g = Aᵀr. The end of h among the d that leave S below its
@@ -183,57 +206,63 @@ def ends(
     that makes nothing better is taken back, and the next is shorter: h may have its end
     within the region, as the longest component of a base does.
     """
-    residuals = coplanarity.residuals(mask_unusable(pair)[0], centre)
-    lowest = total(residuals() ** 2)
-    white = lambda x: residuals(tuple(x))
-    number = lambda x: quantity(centre, centre.move(x).normalise())
 
-    def end(which: Int[Array, ""], sign: Number) -> Number:
-        value_of = lambda x: number(x)[which]
+    white: Callable
+    value: Callable
+    origin: Float[Array, "5"]
+    limit: Number
+    sign: Number
 
-        def step(x: Array) -> tuple[Array, Number, Number]:
-            """The step from x, its length, and the standard deviation of h there for
-            sigma0 = 1."""
-            columns = jax.jacfwd(white)(x)
-            n, g, squares = normal.accumulate([white(x)], [[c] for c in columns.T])
-            q, g = normal.dense(normal.inverse(n)[0]), jnp.stack(list(g))
-            slope = jax.grad(value_of)(x)
-            along, down = q @ slope, q @ g
-            left = limit - (squares - lowest) + g @ down
-            reach = jnp.sqrt(jnp.maximum(left, 0.0) / (slope @ along))
-            step = sign * reach * along - down
-            return step, jnp.sqrt(step @ normal.dense(n) @ step), slope @ along
-
-        def at(x: Array) -> tuple[Number, Number]:
-            """The value there, and its merit over the width of the interval."""
-            value, rise = value_of(x), total(white(x) ** 2) - lowest
-            above = jnp.maximum(rise / limit - 1, 0.0)
-            return value, sign * (value - value_of(origin)) / width - above
-
-        def further(way: _Way) -> _Way:
-            direction, length, _ = step(way.x)
-            part = jnp.minimum(1.0, way.longest * jnp.sqrt(limit) / length)
-            x = way.x + part * direction
-            value, merit = at(x)
-            gain = merit - way.merit
-            small = jnp.abs(gain) < CLOSE
-            longest = jnp.minimum(way.longest / SHORTER, LONGEST)
-            moved = _Way(x, value, merit, longest, small, way.left - 1)
-            stay = way._replace(
-                longest=jnp.minimum(way.longest, length / jnp.sqrt(limit)) * SHORTER,
-                arrived=small,
-                left=way.left - 1,
-            )
-            return jax.tree.map(lambda a, b: jnp.where(gain > 0, a, b), moved, stay)
-
-        origin = jnp.zeros(centre.count)
-        width = jnp.sqrt(limit * step(origin)[2])
-        longest, left = jnp.asarray(LONGEST), jnp.asarray(MOST_STEPS)
-        start = _Way(origin, *at(origin), longest, jnp.asarray(False), left)
+    def find(self) -> Number:
+        """The value there; infinite where it is not reached."""
+        width = jnp.sqrt(self.limit * self.step(self.origin).variance)
+        first = _Way(
+            x=self.origin,
+            merit=self.merit(self.origin, width),
+            longest=jnp.asarray(LONGEST),
+            arrived=jnp.asarray(False),
+            left=jnp.asarray(MOST_STEPS),
+        )
         goes_on = lambda way: ~way.arrived & (way.left > 0)
-        last = jax.lax.while_loop(goes_on, further, start)
-        return jnp.where(last.arrived, last.value, sign * jnp.inf)
+        further = lambda way: self.further(way, width)
+        last = jax.lax.while_loop(goes_on, further, first)
+        return jnp.where(last.arrived, self.value(last.x), self.sign * jnp.inf)
 
-    numbers = jnp.arange(jax.eval_shape(number, jnp.zeros(centre.count)).size)
-    ends = jax.vmap(end, in_axes=(0, None))
-    return Interval(ends(numbers, jnp.asarray(-1.0)), ends(numbers, jnp.asarray(1.0)))
+    def further(self, way: _Way, width: Number) -> _Way:
+        """The next place, or the same one with a shorter step to follow."""
+        unit = jnp.sqrt(self.limit)
+        step = self.step(way.x)
+        x = way.x + step.x * jnp.minimum(1.0, way.longest * unit / step.length)
+        merit = self.merit(x, width)
+        gain = merit - way.merit
+        small = jnp.abs(gain) < CLOSE
+        longer = jnp.minimum(way.longest / SHORTER, LONGEST)
+        shorter = jnp.minimum(way.longest, step.length / unit) * SHORTER
+        moved = _Way(x, merit, longer, small, way.left - 1)
+        stayed = _Way(way.x, way.merit, shorter, small, way.left - 1)
+        return jax.tree.map(lambda a, b: jnp.where(gain > 0, a, b), moved, stayed)
+
+    def step(self, x: Float[Array, "5"]) -> _Step:
+        """The step from x to the end as the parabola at x has it."""
+        columns = jax.jacfwd(self.white)(x)
+        n, g, squares = normal.accumulate([self.white(x)], [[c] for c in columns.T])
+        q, g = normal.dense(normal.inverse(n)[0]), jnp.stack(list(g))
+        slope = jax.grad(self.value)(x)
+        along, down = q @ slope, q @ g
+        variance = slope @ along
+        left = self.limit - (squares - self.squares(self.origin)) + g @ down
+        reach = jnp.sqrt(jnp.maximum(left, 0.0) / variance)
+        step = self.sign * reach * along - down
+        length = jnp.sqrt(step @ normal.dense(n) @ step)
+        return _Step(step, length, variance)
+
+    def merit(self, x: Float[Array, "5"], width: Number) -> Number:
+        """The value beyond that of the origin, over the width of the interval, less what
+        S is above the limit."""
+        gained = self.sign * (self.value(x) - self.value(self.origin)) / width
+        rise = self.squares(x) - self.squares(self.origin)
+        return gained - jnp.maximum(rise / self.limit - 1, 0.0)
+
+    def squares(self, x: Float[Array, "5"]) -> Number:
+        """S."""
+        return total(self.white(x) ** 2)
