@@ -13,6 +13,11 @@ A camera looks along -z with y up, as a photo does here: of P = R X + t
     p = -P / Pz,    (x, y) = f (1 + k1 |p|² + k2 |p|⁴) p
 
 in pixels from the centre of the photo. The photo coordinates are f p.
+
+Comments may stand anywhere. An entry that cannot be used, such as a view on a camera
+without a focal length or a camera of nan (-1.#IND), is left out, and a warning counts
+what was left out. Lines that are missing or cut stop the reading: what follows would be
+taken for something else.
 """
 
 from collections.abc import Sequence
@@ -20,20 +25,28 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from ..tables.fields import TableError, read_text
+from ..tables.fields import TableError
 from . import lens
-from .matches import LEAST, Matches, Seen, Tracks, collect
+from .lines import Lines, is_whole
+from .matches import LEAST, Matches, Seen, Tracks, check_names, collect, is_focal
 
-VERSION = "# Bundle file v0.3"
+FORMAT = "# Bundle file"
+VERSION = f"{FORMAT} v0.3"
+
+MOST_WARNINGS = 12
+"""Reasons to leave views out that are told of one file, the most frequent ones."""
 
 
 class _Camera(NamedTuple):
+    """A camera and its first line. `fault`: why it cannot be used, "" where it can."""
+
     line: int
     focal: float
     k1: float
     k2: float
+    fault: str
 
 
 class _Views(NamedTuple):
@@ -43,6 +56,36 @@ class _Views(NamedTuple):
     camera: list[int]
     place: list[tuple[float, float]]
     line: list[int]
+
+
+class _LeftOut:
+    """What is left out of a file: of each thing and reason how many, and the line of
+    the first."""
+
+    def __init__(self, file: str):
+        self._file = file
+        self._found: dict[tuple[str, str], list[int]] = {}
+
+    def add(self, thing: str, why: str, line: int) -> None:
+        """Count a thing, "view", with the reason, "on camera 3, which ..."."""
+        self._found.setdefault((thing, why), [0, line])[0] += 1
+
+    @property
+    def line(self) -> int | None:
+        """The first line of what is left out most; None where nothing is."""
+        return max(self._found.values(), default=[0, None])[1]
+
+    def warnings(self) -> list[str]:
+        """A sentence for each reason, the most frequent ones first."""
+        most = sorted(self._found.items(), key=lambda entry: -entry[1][0])
+        told = []
+        for (thing, why), (count, line) in most[:MOST_WARNINGS]:
+            things, are = (thing, "is") if count == 1 else (f"{thing}s", "are")
+            where = f"line {line}" if count == 1 else f"first on line {line}"
+            told.append(f"{count} {things} {why}, {are} left out ({where})")
+        if rest := sum(count for _, (count, _) in most[MOST_WARNINGS:]):
+            told.append(f"{rest} other entries are left out")
+        return [f"{self._file}: {sentence}" for sentence in told]
 
 
 def read_bundler(
@@ -56,12 +99,12 @@ def read_bundler(
     distortion. `sigma`: the standard deviation of a pixel coordinate. `photos`: their
     names in the order of the cameras; without them their numbers 0, 1, ...
 
-    Raises TableError for what is no such file, with line and field; and for a place
-    that the distortion of its camera cannot make.
+    Warnings count the entries that are left out. Raises TableError for what is no such
+    file, with line and field.
     """
     file = str(path)
-    lines = _Lines(file, read_text(Path(path)))
-    cameras, views, points = _parse(lines)
+    lines, left_out = Lines(Path(path)), _LeftOut(file)
+    cameras, views, points = _parse(lines, left_out)
     names = [str(k) for k in range(len(cameras))] if photos is None else list(photos)
     if len(names) != len(cameras):
         raise TableError(
@@ -69,15 +112,17 @@ def read_bundler(
             found=f"{len(cameras)} cameras beside {len(names)} names of photos",
             expected="a name for each camera",
         )
+    check_names(file, names)
+    seen, there = _without_distortion(cameras, views, left_out)
     tracks, twice = Tracks(
-        photo=np.array(views.camera, int),
-        point=np.array(views.point, int),
-        seen=_without_distortion(file, cameras, views),
+        photo=np.array(views.camera, int)[there],
+        point=np.array(views.point, int)[there],
+        seen=seen.choose(there),
         photos=names,
         points=[str(k) for k in range(points)],
         focals=np.array([camera.focal for camera in cameras], float),
     ).once()
-    warnings = []
+    warnings = left_out.warnings()
     if twice:
         warnings.append(
             f"{file}: {twice} times a photo shows a point at two places; both are left "
@@ -85,159 +130,138 @@ def read_bundler(
         )
     pairs = tracks.pairs(least)
     if not pairs:
+        why = f" ({warnings[0].removeprefix(f'{file}: ')})" if warnings else ""
         raise TableError(
             file,
-            found=f"no two photos that share {least} points",
+            line=left_out.line,
+            found=f"no two photos that share {least} points{why}",
             expected="a pair of photos with as many",
         )
     return collect(file, pairs, sigma, warnings)
 
 
-class _Lines:
-    """The lines of a file, one behind the other."""
-
-    def __init__(self, file: str, text: str):
-        self.file, self._lines, self.number = file, text.splitlines(), 0
-
-    def next(self, what: str) -> list[str]:
-        """The fields of the next line that is not blank. Raises TableError at the end
-        of the file; `what`: it was to hold."""
-        while self.number < len(self._lines):
-            self.number += 1
-            fields = self._lines[self.number - 1].split()
-            if fields:
-                return fields
-        raise self.error("the end of the file", what, line=self.number + 1)
-
-    def numbers(self, what: str, names: Sequence[str]) -> list[float]:
-        """A line of so many numbers with these names. Raises TableError."""
-        fields = self.next(f"{what}: {' '.join(names)}")
-        if len(fields) != len(names):
-            found = f"{len(fields)} fields for {what}"
-            raise self.error(found, f"{len(names)}: {' '.join(names)}")
-        return [
-            self.number_of(field, f"{what}, {name}")
-            for field, name in zip(fields, names, strict=True)
-        ]
-
-    def number_of(self, field: str, what: str, whole: bool = False) -> float:
-        """A finite number, or a whole one that is not negative. Raises TableError."""
-        try:
-            value = float(field)
-        except ValueError:
-            value = np.nan
-        if whole and not (value >= 0 and value == int(value)):
-            raise self.error(repr(field), "a whole number such as 12", what)
-        if not np.isfinite(value):
-            raise self.error(repr(field), "a finite number such as -12.345", what)
-        return value
-
-    def error(
-        self,
-        found: str,
-        expected: str,
-        column: str | None = None,
-        line: int | None = None,
-    ) -> TableError:
-        """The error at this line."""
-        line = self.number if line is None else line
-        return TableError(
-            self.file, line=line, column=column, found=found, expected=expected
-        )
-
-
-def _parse(lines: _Lines) -> tuple[list[_Camera], _Views, int]:
+def _parse(lines: Lines, left_out: _LeftOut) -> tuple[list[_Camera], _Views, int]:
     """Cameras, views, and how many points there are. Raises TableError."""
-    first = " ".join(lines.next(VERSION))
-    if first != VERSION:
-        raise lines.error(
-            repr(first), f"the line {VERSION!r}; no other version is read"
-        )
-    counts = lines.next("the numbers of cameras and points")
+    _check_version(lines)
+    what = "the numbers of cameras and points"
+    counts = lines.fields(what)
     if len(counts) != 2:
-        raise lines.error(f"{len(counts)} fields", "the numbers of cameras and points")
+        raise lines.error(f"{len(counts)} fields", what)
     number, points = (
-        int(lines.number_of(field, f"number of {what}", whole=True))
-        for field, what in zip(counts, ("cameras", "points"), strict=True)
+        lines.whole(field, f"number of {things}")
+        for field, things in zip(counts, ("cameras", "points"), strict=True)
     )
-    cameras = [_parse_camera(lines, k) for k in range(number)]
+    cameras = [_parse_camera(lines, k, left_out) for k in range(number)]
     views = _Views([], [], [], [])
     for k in range(points):
-        lines.numbers(f"point {k}", ("X", "Y", "Z"))
-        lines.next(f"the colour of point {k}")
-        _parse_views(lines, k, cameras, views)
+        place = lines.numbers_of_line(f"point {k}", ("X", "Y", "Z"))
+        line = lines.number
+        lines.numbers_of_line(f"the colour of point {k}", ("red", "green", "blue"))
+        fields = lines.fields(f"the views of point {k}: their number, and camera, key, x, "
+                              "y of each")  # fmt: skip
+        if np.all(np.isfinite(place)):
+            _parse_views(lines, k, fields, cameras, views, left_out)
+        else:
+            left_out.add("point", "whose coordinates are no numbers", line)
     return cameras, views, points
 
 
-def _parse_camera(lines: _Lines, number: int) -> _Camera:
+def _check_version(lines: Lines) -> None:
+    """Reads to the line with the version. Raises TableError where it is another one, or
+    none stands before the first numbers."""
+    line = lines.next_of_any()
+    while line is not None:
+        told = " ".join(line.split())
+        if told == VERSION:
+            return
+        if told.startswith(FORMAT) or (told and not told.startswith("#")):
+            raise lines.error(
+                repr(told), f"the line {VERSION!r}; no other version is read"
+            )
+        line = lines.next_of_any()
+    raise lines.error("the end of the file", VERSION)
+
+
+def _parse_camera(lines: Lines, number: int, left_out: _LeftOut) -> _Camera:
     """A camera. Its rotation and place are looked at as numbers only."""
     what = f"camera {number}"
-    focal, k1, k2 = lines.numbers(what, ("f", "k1", "k2"))
-    line = lines.number
+    focal, k1, k2 = lines.numbers_of_line(what, ("f", "k1", "k2"))
+    line, numbers = lines.number, [focal, k1, k2]
     for row in ("first row of R", "second row of R", "third row of R", "t"):
-        lines.numbers(f"{what}, {row}", ("x", "y", "z"))
-    return _Camera(line, focal, k1, k2)
+        numbers += lines.numbers_of_line(f"{what}, {row}", ("x", "y", "z"))
+    fault = ""
+    if not np.all(np.isfinite(numbers)):
+        fault = "whose numbers cannot be used"
+        left_out.add("camera", fault, line)
+    elif not focal > 0:
+        # the usual entry of a photo that has found no place: told where it has views
+        fault = "which has no focal length"
+    elif not is_focal(focal):
+        fault = f"whose focal length is {focal:g} pixels"
+        left_out.add("camera", fault, line)
+    return _Camera(line, focal, k1, k2, fault)
 
 
 def _parse_views(
-    lines: _Lines, point: int, cameras: list[_Camera], views: _Views
+    lines: Lines,
+    point: int,
+    fields: list[str],
+    cameras: list[_Camera],
+    views: _Views,
+    left_out: _LeftOut,
 ) -> None:
-    """The line of views of a point."""
-    what = f"the views of point {point}"
-    fields = lines.next(f"{what}: their number, and camera, key, x, y of each")
-    count = int(lines.number_of(fields[0], f"number of {what}", whole=True))
-    if len(fields) != 1 + 4 * count:
-        found = f"{len(fields)} fields for {what}, which are {count}"
-        raise lines.error(
-            found, f"{1 + 4 * count}: {count}, and camera, key, x, y of each"
+    """The line of views of a point: their number, and camera, key, x, y of each."""
+    line, told = lines.number, fields[0] if fields else ""
+    if not is_whole(told) or len(fields) != 1 + 4 * int(told):
+        what = f"point {point}, views"
+        lines.value(told, what)  # tells a comma
+        why = "whose line of views has another number of fields than its first one says"
+        left_out.add("point", why, line)
+        return
+    for k in range(1, len(fields), 4):
+        number, _, *place = fields[k : k + 4]
+        x, y = (
+            lines.value(field, f"point {point}, place of a view") for field in place
         )
-    for k in range(count):
-        camera, _, x, y = fields[1 + 4 * k : 5 + 4 * k]
-        own = int(lines.number_of(camera, f"view {k} of point {point}, camera", True))
-        if own >= len(cameras):
-            raise lines.error(
-                f"camera {own}",
-                f"one of the {len(cameras)} from 0",
-                f"view {k}, camera",
-            )
-        if not cameras[own].focal > 0:
-            raise lines.error(
-                f"camera {own}, whose focal length on line {cameras[own].line} is "
-                f"{cameras[own].focal:g}",
-                "views on cameras with a focal length only",
-                f"view {k}, camera",
-            )
-        what = f"view {k} of point {point}"
-        place = lines.number_of(x, f"{what}, x"), lines.number_of(y, f"{what}, y")
+        if not is_whole(number) or not np.isfinite(x + y):
+            left_out.add("view", "whose camera, x or y is no number", line)
+            continue
+        own = int(number)
+        known = own < len(cameras)
+        fault = cameras[own].fault if known else "which the file does not have"
+        if fault:
+            left_out.add("view", f"on camera {own}, {fault}", line)
+            continue
         views.point.append(point)
         views.camera.append(own)
-        views.place.append(place)
-        views.line.append(lines.number)
+        views.place.append((x, y))
+        views.line.append(line)
 
 
-def _without_distortion(file: str, cameras: list[_Camera], views: _Views) -> Seen:
-    """The places in photo coordinates. Raises TableError for one that cannot be."""
+def _without_distortion(
+    cameras: list[_Camera], views: _Views, left_out: _LeftOut
+) -> tuple[Seen, Bool[np.ndarray, " row"]]:
+    """The places in photo coordinates, and which of them a ray is seen at."""
     place = np.array(views.place, float).reshape(-1, 2)
     camera = np.array(views.camera, int)
     rays, slopes = np.zeros_like(place), np.zeros((len(place), 2, 2))
-    for number, own in enumerate(cameras):
-        rows = np.flatnonzero(camera == number)
-        if not len(rows):
-            continue
+    there = np.zeros(len(place), bool)
+    order = np.argsort(camera, kind="stable")
+    numbers, begins = np.unique(camera[order], return_index=True)
+    for number, rows in zip(numbers, np.split(order, begins[1:]), strict=False):
+        own = cameras[number]
         coefficients = lens.check_coefficients((own.k1, own.k2))
         found = lens.undistort(place[rows] / own.focal, coefficients)
-        if not np.all(found.found):
-            row = rows[int(np.argmax(~found.found))]
-            x, y = place[row]
-            raise TableError(
-                file,
-                line=views.line[row],
-                column=f"x y of camera {number}",
-                found=f"({x:g}, {y:g}), where the distortion k1 = {own.k1:g}, "
-                f"k2 = {own.k2:g} of line {own.line} shows no ray",
-                expected="places that the distortion reaches; delete this view, or "
-                "write the file without distortion",
-            )
         rays[rows], slopes[rows] = found.rays * own.focal, found.slopes
+        there[rows] = found.found
     cofactors: Float[np.ndarray, "row 2 2"] = slopes @ np.swapaxes(slopes, -1, -2)
-    return Seen(rays[:, 0], rays[:, 1], cofactors)
+    seen = Seen(rays[:, 0], rays[:, 1], cofactors)
+    there &= seen.usable
+    for row in np.flatnonzero(~there):
+        own = cameras[camera[row]]
+        why = (
+            f"on camera {camera[row]}, whose distortion k1 = {own.k1:g}, k2 = "
+            f"{own.k2:g} (line {own.line}) shows no ray there"
+        )
+        left_out.add("view", why, views.line[row])
+    return seen, there

@@ -2,15 +2,13 @@
 the same names: pairs of photos that share points. Needs the extra `colmap`."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..tables.fields import TableError
-from .colmap_cameras import pycolmap, see_by
+from .colmap_cameras import see_by
+from .colmap_model import Model, read_model
 from .matches import LEAST, Matches, Seen, Tracks, collect
-
-FILES = ("cameras", "images", "points3D")
 
 
 def read_colmap_text(
@@ -24,9 +22,8 @@ def read_colmap_text(
     point of the model are not read. Raises TableError for what is no model.
     """
     folder = Path(path)
-    model = _read_model(folder)
     warnings: list[str] = []
-    tracks, twice = _tracks(folder, model, warnings).once()
+    tracks, twice = _tracks(read_model(folder), str(folder), warnings).once()
     if twice:
         warnings.append(
             f"{folder}: {twice} times a photo shows a point at two keypoints; both are "
@@ -42,72 +39,35 @@ def read_colmap_text(
     return collect(str(folder), pairs, sigma, warnings)
 
 
-def _read_model(folder: Path) -> Any:
-    """The model of pycolmap. Raises TableError."""
-    for ending in ("txt", "bin"):
-        there = [f"{name}.{ending}" for name in FILES]
-        if all((folder / name).is_file() for name in there):
-            break
-    else:
-        names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
-        found = f"a folder with {', '.join(names[:9]) or 'nothing'}"
-        raise TableError(
-            folder,
-            found=found if folder.is_dir() else "no folder",
-            expected="a folder with cameras.txt, images.txt and points3D.txt",
-        )
-    model = pycolmap().Reconstruction()
-    try:
-        read = model.read_text if ending == "txt" else model.read_binary
-        read(str(folder))
-    except Exception as error:  # pycolmap raises whatever its parser meets
-        raise TableError(
-            folder,
-            found=f"a model that pycolmap does not read ({_first_line(error)})",
-            expected=f"{', '.join(there)} as COLMAP writes them",
-        ) from None
-    return model
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def _tracks(folder: Path, model: Any, warnings: list[str]) -> Tracks:
-    """Where the points of the model are seen. Raises TableError for a photo whose
-    camera is none."""
-    images = sorted(model.images.values(), key=lambda image: image.name)
-    number = {point: k for k, point in enumerate(sorted(model.points3D))}
+def _tracks(model: Model, file: str, warnings: list[str]) -> Tracks:
+    """Where the points of the model are seen, photo by photo in the order of their
+    names; what is left out is added to the warnings."""
     photo, point, seen, focals = [], [], [], []
-    for k, image in enumerate(images):
-        keypoints = [p for p in image.points2D if p.has_point3D()]
-        pixels = np.array([p.xy for p in keypoints], float).reshape(-1, 2)
-        if image.camera_id not in model.cameras:
-            raise TableError(
-                folder,
-                column=image.name,
-                found=f"camera {image.camera_id}",
-                expected="a camera of the model",
-            )
-        places, focal, there = see_by(model.cameras[image.camera_id], pixels)
+    photos = sorted(model.photos, key=lambda photo: photo.name)
+    unknown = 0
+    for k, one in enumerate(photos):
+        known = np.isin(one.points, model.points)
+        unknown += int(np.sum(~known))
+        places, focal, there = see_by(one.camera, one.places[known])
         if not np.all(there):
             warnings.append(
-                f"{folder}: {int(np.sum(~there))} points of photo {image.name!r} are "
-                "left out, which its camera cannot have seen in front of the photo"
+                f"{file}: {int(np.sum(~there))} points of photo {one.name!r} are left "
+                "out, which its camera cannot have seen in front of the photo"
             )
-        own = np.array([number[p.point3D_id] for p in keypoints], int)
+        own = np.searchsorted(model.points, one.points[known])
         photo.append(np.full(int(np.sum(there)), k))
         point.append(own[there])
         seen.append(places.choose(there))
         focals.append(focal)
-    together = lambda parts: np.concatenate(parts) if parts else np.zeros(0, int)
-    if not images:
-        raise TableError(folder, found="no photos", expected="a model with photos")
+    if unknown:
+        warnings.append(
+            f"{file}: {unknown} keypoints are left out whose point is none of the model"
+        )
     return Tracks(
-        photo=together(photo),
-        point=together(point),
+        photo=np.concatenate(photo),
+        point=np.concatenate(point),
         seen=Seen(*map(np.concatenate, zip(*seen, strict=True))),
-        photos=[image.name for image in images],
-        points=[str(point) for point in number],
+        photos=[one.name for one in photos],
+        points=list(map(str, model.points)),
         focals=np.array(focals, float),
     )

@@ -4,7 +4,8 @@ told by their kind."""
 from pathlib import Path
 
 from .bundler import read_bundler
-from .colmap_text import FILES, read_colmap_text
+from .colmap_model import FILES
+from .colmap_text import read_colmap_text
 from .h5 import read_h5
 from .matches import Matches
 

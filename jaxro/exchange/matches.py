@@ -17,6 +17,7 @@ from ..batches.ragged import Ragged
 from ..geometry.cofactor_roots import CofactorRoots, from_covariances
 from ..geometry.pairs import Camera
 from ..tables.cameras import Cameras
+from ..tables.fields import TableError
 from ..tables.measured import COORDINATES, COVARIANCES, DEVIATIONS, Table
 
 EQUAL = 1e-12
@@ -24,6 +25,23 @@ EQUAL = 1e-12
 
 LEAST = 6
 """Points that two photos must share to be a pair: fewer do not check an orientation."""
+
+MARKS = ("-", " - ", " and ")
+"""Between the names of two photos in that of their pair."""
+
+FOCALS = 1e-3, 1e9
+"""Pixels between which a focal length lies: of other numbers a file is damaged."""
+
+FARTHEST = 1e9
+"""Pixels from the principal point beyond which there is no place of a photo."""
+
+VARIANCES = 1e-12, 1e12
+"""Between these the eigenvalues of usable cofactors lie."""
+
+
+def is_focal(focal: float) -> bool:
+    """Whether this is a focal length in pixels."""
+    return bool(FOCALS[0] <= focal <= FOCALS[1])
 
 
 class Seen(NamedTuple):
@@ -37,6 +55,16 @@ class Seen(NamedTuple):
     def choose(self, rows: Any) -> "Seen":
         """Some of the points."""
         return Seen(*(a[rows] for a in self))
+
+    @property
+    def usable(self) -> Bool[np.ndarray, " point"]:
+        """Which points have coordinates and cofactors that can be calculated with."""
+        least, most = VARIANCES
+        (xx, xy), (_, yy) = np.moveaxis(self.cofactors, 0, -1)
+        with np.errstate(all="ignore"):
+            trace, det = xx + yy, xx * yy - xy**2
+            near = np.maximum(np.abs(self.x), np.abs(self.y)) <= FARTHEST
+            return near & (trace <= most) & (det >= least * trace)
 
 
 class Match(NamedTuple):
@@ -160,6 +188,28 @@ def collect(
     )
 
 
+def check_names(file: str, names: Sequence[str]) -> None:
+    """Raises TableError where two photos have one name."""
+    seen: dict[str, int] = {}
+    for number, name in enumerate(names):
+        if seen.setdefault(name, number) != number:
+            raise TableError(
+                file,
+                found=f"the name {name!r} of photos {seen[name]} and {number}",
+                expected="a name of its own for each photo",
+            )
+
+
+def join_names(photos: Sequence[tuple[str, str]]) -> list[str]:
+    """The names of pairs, LEFT-RIGHT; with another mark where two would be the same
+    (1-2 and 3, 1 and 2-3)."""
+    for mark in MARKS:
+        names = [mark.join(both) for both in photos]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{name} ({k})" for k, name in enumerate(names, 1)]
+
+
 class Tracks(NamedTuple):
     """Points that are seen on many photos, one row for each place: the numbers of its
     photo and of its point. `focals` of the photos in pixels; `names` of both."""
@@ -199,16 +249,21 @@ class Tracks(NamedTuple):
         both = np.stack([shared.row, shared.col])[:, enough]
         both = both[:, np.lexsort(both[::-1])]
         rows = _rows_by_point(self)
-        return [self._match(rows, int(i), int(j)) for i, j in both.T]
+        photos = [(self.photos[int(i)], self.photos[int(j)]) for i, j in both.T]
+        names = join_names(photos)
+        return [
+            self._match(name, rows, int(i), int(j))
+            for name, (i, j) in zip(names, both.T, strict=True)
+        ]
 
-    def _match(self, rows: list[np.ndarray], i: int, j: int) -> Match:
+    def _match(self, name: str, rows: list[np.ndarray], i: int, j: int) -> Match:
         """The pair of two photos."""
         of_left, of_right = self.point[rows[i]], self.point[rows[j]]
         common, left, right = np.intersect1d(
             of_left, of_right, assume_unique=True, return_indices=True
         )
         return Match(
-            name=f"{self.photos[i]}-{self.photos[j]}",
+            name=name,
             photos=(self.photos[i], self.photos[j]),
             points=tuple(self.points[int(k)] for k in common),
             left=self.seen.choose(rows[i][left]),

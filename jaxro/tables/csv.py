@@ -106,11 +106,8 @@ def no_points(file: str, line: int) -> TableError:
 
 def lines(path: Path, semicolons: bool = False) -> Iterator[Line]:
     """The `check_lines` lines of a file, one at a time. Raises TableError."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            yield from check_lines(file, str(path), semicolons=semicolons)
-    except (OSError, UnicodeDecodeError):
-        read_text(path)  # says which
+    text = fields.text_lines(path)
+    yield from check_lines(text, str(path), semicolons=semicolons)
 
 
 def check_lines(

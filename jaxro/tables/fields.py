@@ -154,6 +154,16 @@ def read_text(path: Path) -> str:
         ) from None
 
 
+def text_lines(path: Path) -> Iterator[str]:
+    """The lines of a UTF-8 file, one at a time, each with its end. Raises TableError as
+    `read_text` does."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            yield from file
+    except (OSError, UnicodeDecodeError):
+        read_text(path)  # says which
+
+
 def lines_of(
     text: Iterable[str], file: str, columns: Columns, semicolons: bool = False
 ) -> Iterator[tuple[int, dict[str, str]]]:

@@ -107,16 +107,15 @@ def change(line, new):
     ("changed", "told"),
     [
         (change(1, "# Bundle file v0.1"), "line 1: found '# Bundle file v0.1'"),
+        (change(1, "# Bundled"), "line 2: found '3 30'; expected the line"),
         (change(2, "3"), "line 2: found 1 fields; expected the numbers of cameras"),
         (change(2, "3 x"), "line 2, column number of points: found 'x'"),
+        (change(2, f"{10**12} 30"), "line 20: found 9 fields for camera 3, second row"),
         (change(3, "700 -0.18"), "line 3: found 2 fields for camera 0; expected 3: f k1"),
-        (change(8, "650 k 0"), "line 8, column camera 1, k1: found 'k'"),
-        (change(8, "0 0 0"), "camera 1, whose focal length on line 8 is 0"),
-        (change(3, "700 -2.5 0"), "where the distortion k1 = -2.5, k2 = 0 of line 3"),
+        (change(3, "700,5 0 0"), "column camera 0, f: found '700,5', a comma in a number"),
         (change(18, "1 2"), "line 18: found 2 fields for point 0; expected 3: X Y Z"),
-        (change(20, "2 0 0 1 2 2 0 1"), "line 20: found 8 fields for the views of point 0"),
-        (change(20, "1 0 0 1 inf"), "column view 0 of point 0, y: found 'inf'"),
-        (change(20, "1 7 0 1 2"), "line 20, column view 0, camera: found camera 7"),
+        (change(19, "2 0 1 2 2 0 1 2 2"), "line 19: found 9 fields for the colour of point 0"),
+        (change(20, "1 0 0 1,5 2"), "line 20, column point 0, place of a view: found '1,5'"),
         (lambda lines: lines[:-1], "line 107: found the end of the file; expected the views"),
         (lambda lines: [lines[0], "0 0"], "found no two photos that share 6 points"),
     ],
@@ -126,6 +125,77 @@ def test_what_does_not_fit_is_told(changed, told, path):
     with pytest.raises(TableError) as error:
         exchange.read_bundler(path)
     assert told in str(error.value)
+
+
+def everywhere(*lines):
+    """Comments before the version, between all lines and behind some."""
+
+    def changed(given):
+        with_comments = ["# by a program", given[0], *lines]
+        for line in given[1:]:
+            with_comments += [f"{line} # {len(with_comments)}", "", "  # a comment"]
+        return with_comments
+
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("changed", "told", "lengths"),
+    [
+        (everywhere("# 4 40"), [], [29, 30, 29]),
+        (change(8, "0 0 0"), ["29 views on camera 1, which has no focal length, are left "
+                              "out (first on line 23)"], [30]),
+        (change(9, "-1.#IND nan -inf"), ["29 views on camera 1, whose numbers cannot be used",
+                                         "1 camera whose numbers cannot be used, is left out "
+                                         "(line 8)"], [30]),
+        (change(3, "1e300 0 0"), ["30 views on camera 0, whose focal length is 1e+300",
+                                   "1 camera whose focal length"], [29]),
+        (change(3, "700 -2.5 0"), ["camera 0, whose distortion k1 = -2.5, k2 = 0 (line 3) shows"],
+         None),
+        (change(20, "1 7 0 1 2"), ["1 view on camera 7, which the file does not have, is left "
+                                   "out (line 20)"], [29, 29, 29]),
+        (change(20, "1 0 0 1 inf"), ["1 view whose camera, x or y is no number, is left out"],
+         [29, 29, 29]),
+        (change(20, "1 -1 0 1 2"), ["1 view whose camera, x or y is no number"], [29, 29, 29]),
+        (change(20, "2 0 0 1 2 2 0 1"), ["1 point whose line of views has another number"],
+         [29, 29, 29]),
+        (change(18, "nan nan nan"), ["1 point whose coordinates are no numbers, is left out "
+                                     "(line 18)"], [29, 29, 29]),
+    ],
+)  # fmt: skip
+def test_an_entry_that_cannot_be_used_is_left_out(changed, told, lengths, path):
+    """The first point is seen by the photos 0 and 2 only; all others by three."""
+    write(path, changed(lines_of()))
+    found = exchange.read_bundler(path)
+    for sentence in told:
+        assert any(sentence in warning for warning in found.warnings), found.warnings
+    assert len(found.warnings) == len(told)
+    if lengths is not None:
+        assert found.pairs.lengths.tolist() == lengths
+
+
+def test_a_file_of_which_nothing_is_left_tells_why(path):
+    lines = lines_of()
+    for k in (3, 8):
+        lines = change(k, "0 0 0")(lines)
+    write(path, lines)
+    with pytest.raises(
+        TableError, match=r"line 20: .* \(30 views on camera 0, which has"
+    ):
+        exchange.read_bundler(path)
+
+
+def test_photos_of_one_name_are_refused(path):
+    write(path, lines_of())
+    with pytest.raises(TableError, match="the name 'a' of photos 0 and 2"):
+        exchange.read_bundler(path, photos=["a", "b", "a"])
+
+
+def test_pairs_have_names_of_their_own(path):
+    """1-2-1-2-1 would be two of them."""
+    write(path, lines_of())
+    found = exchange.read_bundler(path, photos=["1-2", "1-2-1", "2-1"])
+    assert found.names == ("1-2 - 1-2-1", "1-2 - 2-1", "1-2-1 - 2-1")
 
 
 def test_photographs_of_balbianello(data):

@@ -107,22 +107,107 @@ def test_covariances_are_those_of_pixels_without_distortion(tmp_path):
     np.testing.assert_allclose(batch.x_left[0], own.x_left, atol=1e-6)
 
 
+def edit(old, new):
+    """Text in place of another, once."""
+
+    def changed(text):
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return changed
+
+
 @pytest.mark.parametrize(
-    ("name", "text", "told"),
+    ("name", "changed", "told"),
     [
         ("points3D.txt", None, "found a folder with cameras.txt, images.txt"),
-        ("cameras.txt", "1 LENS 640 480 1\n", "a model that pycolmap does not read"),
-        ("images.txt", "", "Image with ID 1 does not exist"),
+        ("cameras.txt", edit("1 OPENCV", "1 LENS"), "line 2, column camera 1: found the model"),
+        ("cameras.txt", edit("790.0 ", ""), "found 7 parameters of model OPENCV, which has 8"),
+        ("cameras.txt", edit("812.0", "812,0"), "line 2, column PARAMS: found '812,0', a comma"),
+        ("cameras.txt", edit("812.0", "nan"), "line 2, column PARAMS: found 'nan'"),
+        ("cameras.txt", edit("812.0", "1e300"), "found the parameters [1e+300"),
+        ("cameras.txt", edit("7 PINHOLE 640", "7 PINHOLE -640"), "line 3, column WIDTH: found"),
+        ("cameras.txt", edit("7 PIN", "1 PIN"), "line 3: found camera 1 a second time"),
+        ("images.txt", lambda text: "", "images.txt: found no photos"),
+        ("images.txt", edit("b/second", "b/first"),
+         "line 3, column NAME: found the name 'b/first.jpg' a second time (first on line 1)"),
+        ("images.txt", edit("1.0 0.0", "1,0 0.0"), "a comma in a number"),
+        ("images.txt", edit(" 7 a.jpg", " 8 a.jpg"), "line 5, column CAMERA: found camera 8"),
+        ("images.txt", edit(" a.jpg", ""), "line 5: found a photo without a name"),
+        ("images.txt", edit("11.5 12.5 -1", "11.5 12.5"), "line 2: found 92 fields"),
+        ("images.txt", edit(" 100 ", " 1e2 "), "line 2, column POINT of a keypoint: found '1e2'"),
+        ("points3D.txt", edit("0 0 0", "0"), ""),
+        ("points3D.txt", lambda text: text.replace(".", ","), "line 1, column X: found"),
     ],
-)
-def test_what_does_not_fit_is_told(name, text, told, tmp_path):
+)  # fmt: skip
+def test_what_does_not_fit_is_told(name, changed, told, tmp_path):
     write(tmp_path)
-    if text is None:
-        (tmp_path / name).unlink()
+    path = tmp_path / name
+    if changed is None:
+        path.unlink()
     else:
-        (tmp_path / name).write_text(text)
+        path.write_text(changed(path.read_text()))
+    if told == "":  # nothing that is needed
+        assert len(exchange.read_colmap_text(tmp_path).names) == 3
+        return
     with pytest.raises(TableError) as error:
         exchange.read_colmap_text(tmp_path)
+    assert told in str(error.value)
+
+
+def test_names_are_read_whole(tmp_path):
+    """Also with blanks, which COLMAP's own reader cuts."""
+    write(tmp_path)
+    path = tmp_path / "images.txt"
+    names = {
+        NAMES[0]: "DJI 1.JPG",
+        NAMES[1]: "DJI  1.JPG",
+        NAMES[2]: "sub dir/1 # 2.JPG",
+    }
+    text = path.read_text()
+    for name, new in names.items():
+        text = text.replace(name, new)
+    path.write_text(text)
+    found = exchange.read_colmap_text(tmp_path)
+    assert {*found.left, *found.right} == {*names.values()}
+
+
+def test_binary_files_hold_the_same(tmp_path):
+    """As pycolmap writes them, of a model that pycolmap has read."""
+    write(tmp_path, hidden=(3,))
+    model = pycolmap.Reconstruction()
+    model.read_text(str(tmp_path))
+    folder = tmp_path / "binary"
+    folder.mkdir()
+    model.write_binary(str(folder))
+    one, other = files.read(tmp_path), files.read(folder)
+    assert one.names == other.names and one.points == other.points
+    np.testing.assert_array_equal(one.pairs.x_left, other.pairs.x_left)
+    np.testing.assert_array_equal(one.pairs.y_right, other.pairs.y_right)
+
+
+@pytest.mark.parametrize(
+    ("name", "changed", "told"),
+    [
+        ("images", lambda content: content[:1000], "bytes for"),
+        ("images", lambda content: (10**12).to_bytes(8, "little") + content[8:], "column photo 3"),
+        ("images", lambda content: content + b"\0", "found 1 bytes behind the last entry"),
+        ("cameras", lambda content: content[:12] + b"\x63" + content[13:], "found the model 99"),
+        ("points3D", lambda content: content[:51] + b"\xff" * 8 + content[59:],
+         "the track of point entry 0"),
+    ],
+)  # fmt: skip
+def test_counts_beyond_the_file_are_told(name, changed, told, tmp_path):
+    write(tmp_path)
+    model = pycolmap.Reconstruction()
+    model.read_text(str(tmp_path))
+    folder = tmp_path / "binary"
+    folder.mkdir()
+    model.write_binary(str(folder))
+    path = folder / f"{name}.bin"
+    path.write_bytes(changed(path.read_bytes()))
+    with pytest.raises(TableError, match=r"byte \d+, column") as error:
+        files.read(folder)
     assert told in str(error.value)
 
 

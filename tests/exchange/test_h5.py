@@ -186,6 +186,79 @@ def test_what_does_not_fit_is_told(write, told, path):
     assert told in str(error.value)
 
 
+def linked(kind, target):
+    """A file whose x1 stands elsewhere."""
+
+    def write(file):
+        group = put(file, "a")
+        file["elsewhere"] = group["x1"][:]
+        del group["x1"]
+        group["x1"] = kind(target)
+
+    return write
+
+
+def stored(**how):
+    """A file whose x1 claims other values than it holds."""
+
+    def write(file):
+        group = put(file, "a")
+        del group["x1"]
+        group.create_dataset("x1", dtype="f8", **how)
+
+    return write
+
+
+def virtual(file):
+    group = put(file, "a")
+    del group["x1"]
+    layout = h5py.VirtualLayout((40, 2), "f8")
+    layout[:] = h5py.VirtualSource("other.h5", "x", (40, 2))
+    group.create_virtual_dataset("x1", layout)
+
+
+@pytest.mark.parametrize(
+    ("write", "told"),
+    [
+        (linked(lambda name: h5py.ExternalLink("b.h5", name), "/x"), "a link out of this file"),
+        (linked(h5py.SoftLink, "/nowhere/x"), "a link to '/nowhere/x', which is not there"),
+        (linked(h5py.SoftLink, "/a/x1"), "column a/x1: found links that lead"),
+        (virtual, "values that lie in another file"),
+        (stored(shape=(40, 2), external=[("b.raw", 0, 640)]), "that lie in another file"),
+        (stored(shape=(10**12, 2), chunks=(10**4, 2), compression="gzip"), "shape (1000000000000"),
+        (stored(shape=(8, 2), chunks=(10**7, 2), maxshape=(None, 2)), "in parts of (10000000, 2)"),
+        (replaced("camera1/params", ["a", "b", "c", "d"]), "a/camera1/params: found values of"),
+        (replaced("camera1/model", [1.0]), "column a/camera1/model: found no text"),
+        (replaced("camera1/params", [1e300, 1, 1, 1]), "K = [[1e+300"),
+        (replaced("camera1", [b"text"]), "column a/camera1: found values of type"),
+        (replaced("x2", np.full((40, 2), 1j)), "column a/x2: found values of type complex128"),
+    ],
+)  # fmt: skip
+def test_what_leads_out_of_the_file_or_claims_too_much_is_refused(write, told, path):
+    with h5py.File(path, "w") as file:
+        write(file)
+    with pytest.raises(TableError) as error:
+        exchange.read_h5(path)
+    assert told in str(error.value)
+
+
+def test_links_within_a_file_are_followed(path):
+    with h5py.File(path, "w") as file:
+        group = put(file, "a", (SIMPLE, SIMPLE))
+        del group["camera2"]
+        group["camera2"] = h5py.SoftLink("camera1")
+    assert exchange.read_h5(path).pairs.lengths.tolist() == [40]
+
+
+def test_matches_without_numbers_are_left_out(path):
+    with h5py.File(path, "w") as file:
+        group = put(file, "a")
+        group["x1"][3], group["x2"][[5, 7]] = np.nan, [[1e300, 0], [0, np.inf]]
+    found = exchange.read_h5(path)
+    assert found.pairs.lengths.tolist() == [37]
+    assert "3 of 40 matches are left out" in found.warnings[0]
+
+
 def test_a_file_of_another_kind_is_told(path):
     path.write_text("point,x_left\n")
     with pytest.raises(TableError, match="no HDF5 file that can be read"):
