@@ -36,6 +36,7 @@ from jaxtyping import ArrayLike, Float, Int
 
 from ..geometry.camera_axes import invert
 from ..orientation.result import Orientation
+from ..tables.fields import tell
 from .pose_covariance import pose_information
 from .poses import cam_from_world
 from .tangents import Tangent, g2o
@@ -113,9 +114,9 @@ def pose_graph(
 
 def g2o_text(graph: PoseGraph) -> str:
     """The graph as the text of a g2o file. Its first lines say which photo has which
-    number."""
+    number; control characters of their names, such as line ends, are escapes there."""
     numbers = lambda values: " ".join(repr(float(value)) for value in values)
-    lines = [f"# {k} {name}" for k, name in enumerate(graph.photos)]
+    lines = [f"# {k} {tell(name)}" for k, name in enumerate(graph.photos)]
     for k, seven in enumerate(_sevens(graph.poses)):
         lines.append(f"VERTEX_SE3:QUAT {k} {numbers(seven)}")
     lines += [f"FIX {k}" for k in graph.fixed]

@@ -69,7 +69,7 @@ from .residuals import (
     draw_residuals as draw_residuals,
     find_zones as find_zones,
 )
-from .style import RED as RED, TITLE as TITLE, new_figure as new_figure
+from .style import RED as RED, TITLE as TITLE, new_figure as new_figure, plain as plain
 from .surface import (
     draw_deviations as draw_deviations,
     draw_heights as draw_heights,

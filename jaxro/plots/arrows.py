@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .style import BLACK, SMALL
+from .style import BLACK, SMALL, plain
 
 LENGTH = 0.14
 """Length of the longest arrow over the longer side of the area, at most."""
@@ -66,7 +66,7 @@ def add_key(axes: Any, drawn: Any, longest: float, unit: str) -> Any:
         0.7,
         1 + ABOVE / (72 * height),
         size,
-        f"{size:g} {unit}",
+        plain(f"{size:g} {unit}"),
         labelpos="E",
         coordinates="axes",
         fontproperties={"size": SMALL},

@@ -11,6 +11,7 @@ from ..calibration import Calibration, correct
 from ..calibration.distortion import distortion_deviations
 from ..xla.programs import compiled
 from .arrows import ROOM, add_key, draw_arrows, enlargement, side_of
+from .labels import show_name
 from .style import (
     BLUE,
     DEVIATIONS,
@@ -190,7 +191,7 @@ def draw_variants(
     at = np.arange(len(names))
     left.barh(at, behind, color=BLUE)
     right.barh(at, left_out, color=ORANGE, hatch="//", edgecolor="white")
-    left.set_yticks(at, [str(name) for name in names])
+    left.set_yticks(at, [show_name(str(name)) for name in names])
     left.invert_yaxis()
     describe(left, "Behind the best", "-2 log evidence", "model")
     describe(right, "Coordinates left out", with_unit("error", unit), "")

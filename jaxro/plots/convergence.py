@@ -16,6 +16,7 @@ from .style import (
     add_legend,
     axes_or_new,
     describe,
+    plain,
 )
 
 AT_REST = 1e-12
@@ -68,7 +69,7 @@ def draw_sums(
             marker=MARKERS[k % len(MARKERS)],
             color=SERIES[k % len(SERIES)],
             ms=5,
-            label=name,
+            label=plain(name),
         )
     axes.axhline(least, color=BLACK, ls=":", lw=1.0, label=f"minimum {least:.4g}")
     axes.xaxis.get_major_locator().set_params(integer=True)

@@ -68,12 +68,12 @@ def add_ellipse_key(
     )
 
     from .arrows import round_down
-    from .style import SMALL
+    from .style import SMALL, plain
 
     size = round_down(size) if size > 0 else 1.0
     bar = AuxTransformBox(axes.transData)
     bar.add_artist(Line2D([0, factor * size], [0, 0], color=colour, marker="|"))
-    text = TextArea(f"half axis {size:g} {unit}", textprops={"size": SMALL})
+    text = TextArea(plain(f"half axis {size:g} {unit}"), textprops={"size": SMALL})
     packed = HPacker(children=[text, bar], align="center", pad=0, sep=5)
     box = AnchoredOffsetbox(
         loc="lower right",

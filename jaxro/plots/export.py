@@ -64,7 +64,8 @@ def figure_of(drawn: Any) -> Any:
 def titles_of(figure: Any) -> list[str]:
     """What the titles of a figure say, in one line each."""
     written = [figure.get_suptitle(), *(axes.get_title() for axes in figure.axes)]
-    return [" ".join(title.split()) for title in written if title]
+    plain = (title.replace(r"\$", "$") for title in written if title)
+    return [" ".join(title.split()) for title in plain]
 
 
 def _bytes(drawn: Any, **how: Any) -> bytes:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..assessment.reliability import BOUNDS, CONTROL, Reliability
-from .labels import NAMED
+from .labels import NAMED, show_name
 from .points import MOST
 from .style import (
     BLACK,
@@ -156,7 +156,7 @@ def _finish(
     if len(shown) > NAMED:
         axes.set_xticks([])
         return
-    every = [str(n) for n in names] or [str(k + 1) for k in range(count)]
+    every = [show_name(str(n)) for n in names] or [str(k + 1) for k in range(count)]
     texts = [every[k] for k in shown]
     long = max(map(len, texts), default=0) * len(texts) > 80
     axes.set_xticks(

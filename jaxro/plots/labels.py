@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .style import SMALL
+from ..tables.fields import tell
+from .style import LONGEST, SMALL, plain
 
 BESIDE = [(5, 4), (5, -9), (-5, 4), (-5, -9), (0, 8), (0, -13), (12, -3), (-12, -3)]
 """Where the label of a point may stand, points of the printer off it; the first ones
@@ -15,8 +16,16 @@ are the best."""
 PAPER = {"boxstyle": "square,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.6}
 """What lies below a label, so that it is read on colours, too."""
 
+NAME = 24
+"""Letters of a name that are shown."""
+
 NAMED = 40
 """Points up to which a picture writes all names."""
+
+
+def show_name(name: str) -> str:
+    """A name as a picture shows it: in one line, and not longer than NAME."""
+    return plain(tell(name, NAME))
 
 
 def place_labels(
@@ -47,7 +56,7 @@ def place_labels(
         if not told:
             continue
         text = axes.annotate(
-            told,
+            plain(tell(told, LONGEST)),
             place,
             BESIDE[0],
             textcoords="offset points",

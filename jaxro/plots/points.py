@@ -11,7 +11,7 @@ from ..assessment.reliability import Reliability
 from ..geometry.pairs import Pair
 from ..rejection import LeaveOneOutGrubbs, Rejection
 from ..rejection.base import AbstractProcedure
-from .labels import NAMED
+from .labels import NAMED, show_name
 from .style import (
     BLACK,
     BLUE,
@@ -43,7 +43,9 @@ def draw_bars(
     that is not finite (a point that nothing tests) is a circle at zero. Of many points
     the `MOST` with the largest values are shown, which the title says."""
     axes = axes_or_new(axes, height=2.6)
-    names = [str(n) for n in names] or [str(k + 1) for k in range(len(values))]
+    names = [show_name(str(n)) for n in names] or [
+        str(k + 1) for k in range(len(values))
+    ]
     size = np.nan_to_num(np.abs(values) if both_sides else values, nan=-np.inf)
     shown = np.sort(np.argsort(-size, kind="stable")[:MOST])
     at, value, size = np.arange(len(shown)), values[shown], size[shown]

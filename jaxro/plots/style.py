@@ -4,7 +4,10 @@ in print, and axes to draw on.
 A colour never says something alone: a symbol, a line style or a text says it, too.
 """
 
+import re
 from typing import Any
+
+from ..tables.fields import tell
 
 BLACK = "#000000"
 ORANGE = "#E69F00"
@@ -30,6 +33,12 @@ WIDTH = 160 / 25.4
 
 TITLE, TEXT, SMALL = 9.0, 8.0, 7.0
 """Sizes of the letters in points, at this width."""
+
+LONGEST = 120
+"""Letters of a line of text that are shown."""
+
+DOLLAR = re.compile(r"(?<!\\)\$")
+"""What matplotlib takes for the beginning of a formula."""
 
 
 def new_figure(height: float = 4.0, width: float = WIDTH) -> Any:
@@ -87,11 +96,18 @@ def _extent(places: Any) -> tuple[float, float]:
     return (wide, high) if max(wide, high) > 0 else (1.0, 1.0)
 
 
+def plain(text: str) -> str:
+    """Text of a user as a picture shows it, once or again: no formula between dollars, no
+    control characters, and no more letters than there is room for."""
+    lines = [tell(line, LONGEST) for line in text.split("\n")]
+    return DOLLAR.sub(r"\\$", "\n".join(lines))
+
+
 def describe(axes: Any, title: str, x: str, y: str, *, room: float = 6.0) -> Any:
     """Write title and names of the axes; `room` between title and axes, points."""
-    axes.set_title(title, fontsize=TITLE, pad=room)
-    axes.set_xlabel(x, fontsize=TEXT)
-    axes.set_ylabel(y, fontsize=TEXT)
+    axes.set_title(plain(title), fontsize=TITLE, pad=room)
+    axes.set_xlabel(plain(x), fontsize=TEXT)
+    axes.set_ylabel(plain(y), fontsize=TEXT)
     axes.tick_params(labelsize=TEXT)
     return axes
 
@@ -132,7 +148,7 @@ def add_colours(axes: Any, drawn: Any, label: str, *, below: bool = False) -> An
     bar = axes.figure.colorbar(
         drawn, ax=axes, location=where, shrink=0.85, aspect=40 if below else 25
     )
-    bar.set_label(label, fontsize=TEXT)
+    bar.set_label(plain(label), fontsize=TEXT)
     bar.ax.tick_params(labelsize=TEXT)
     bar.ax.locator_params(nbins=5)
     return bar

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from .labels import place_labels
+from .labels import place_labels, show_name
 from .model import spans_a_plane
 from .style import (
     BLACK,
@@ -122,4 +122,6 @@ def _finish(axes, x, y, legs, unit, title, told) -> Any:
 
 
 def _told(names: Sequence[str], values: np.ndarray, digits: int) -> list[str]:
-    return [f"{n}  {v:.{digits}f}" for n, v in zip(names, values, strict=False)]
+    return [
+        f"{show_name(n)}  {v:.{digits}f}" for n, v in zip(names, values, strict=False)
+    ]

@@ -28,7 +28,7 @@ def draw(done: Done) -> Any:
     wrong = done.oriented.wrong.rays
     axes = plots.draw_block(done.adjusted, known, wrong=wrong, unit=done.unit)
     told = f"Block of {done.title}, sigma0 {done.adjusted.sigma0:.2f}"
-    plots.figure_of(axes).suptitle(told, fontsize=plots.TITLE)
+    plots.figure_of(axes).suptitle(plots.plain(told), fontsize=plots.TITLE)
     return axes
 
 

@@ -30,7 +30,7 @@ def draw(done: Done, title: str) -> Any:
         names=done.named.names[:n],
     )
     figure = plots.figure_of(axes)
-    figure.suptitle(f"Heights of {title}", fontsize=plots.TITLE)
+    figure.suptitle(plots.plain(f"Heights of {title}"), fontsize=plots.TITLE)
     return axes
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, NoReturn, TextIO
 from rich.console import Console
 from rich.segment import Segment
 
-from ..tables.fields import tell
+from ..tables.fields import tell, tell_lines
 from ..xla import notices
 
 PLAIN = str.maketrans(
@@ -77,8 +77,7 @@ class _Console(Console):
             if segment.control:
                 yield segment
             else:
-                lines = segment.text.split("\n")
-                yield segment._replace(text="\n".join(map(tell, lines)))
+                yield segment._replace(text=tell_lines(segment.text))
 
 
 def consoles() -> tuple[Console, Console]:

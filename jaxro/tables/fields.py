@@ -20,18 +20,27 @@ DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d*(e[-+]?\d+)?", re.IGNORECASE)
 
 
 def tell(text: str, most: int | None = None) -> str:
-    """Text of a user as it may be shown: its control characters replaced, and no longer
-    than `most` letters."""
+    """Text of a user as it may be shown in one line, no longer than `most` letters: line
+    ends, control characters and marks of direction as escapes (\\n, \\u202e)."""
+    if not (text.isascii() and text.isprintable()):
+        text = "".join(
+            letter.encode("unicode_escape").decode() if _is_control(letter) else letter
+            for letter in text
+        )
     if most is not None and len(text) > most:
         text = text[: most - 4] + " ..."
-    if text.isascii() and text.isprintable():
-        return text
-    return "".join("\ufffd" if _is_control(letter) else letter for letter in text)
+    return text
+
+
+def tell_lines(text: str) -> str:
+    """The same of text whose lines stay lines."""
+    return "\n".join(map(tell, text.split("\n")))
 
 
 def _is_control(letter: str) -> bool:
-    """Whether a letter is none but moves, hides or turns others, or is half of one."""
-    return unicodedata.category(letter) in ("Cc", "Cf", "Cs")
+    """Whether a letter is none but moves, hides or turns others, ends the line, or is
+    half of one."""
+    return unicodedata.category(letter) in ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 class TableError(ValueError):

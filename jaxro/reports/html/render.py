@@ -5,7 +5,9 @@ from __future__ import annotations
 import platform
 from datetime import UTC, datetime
 from importlib.metadata import version
+from typing import Any
 
+from ...tables.fields import tell_lines
 from .page import Page
 
 PROGRAMS = ("jaxro", "jax", "optimistix", "numpy")
@@ -25,6 +27,7 @@ def to_html(page: Page) -> str:
     jinja = Environment(
         loader=PackageLoader("jaxro.reports", "html"),
         autoescape=True,
+        finalize=_plain,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -32,6 +35,12 @@ def to_html(page: Page) -> str:
     return jinja.get_template("page.html").render(
         page=page, versions=versions(), made=_now(), long=LONG, shown=SHOWN
     )
+
+
+def _plain(value: Any) -> Any:
+    """Text without control characters and marks of direction; markup as it is."""
+    is_text = isinstance(value, str) and not hasattr(value, "__html__")
+    return tell_lines(value) if is_text else value
 
 
 def to_pdf(page: Page) -> bytes:
