@@ -30,7 +30,6 @@ class Options:
     sigma: float | None = None
     model_sigma: float | None = None
     second: bool = False
-    semicolons: bool = False
     unit: str = "m"
     out: Path | None = None
     force: bool = False
@@ -140,8 +139,8 @@ def _read(options: Options) -> tuple[str, ModelPoints, GroundPoints]:
             found="no table of points on the ground",
             expected="--control GROUND.csv with point,X,Y,Z, blank where unknown",
         )
-    points = model_tables.read(options.file, options.pair, options.semicolons)
-    ground = ground_tables.read(options.control, options.semicolons)
+    points = model_tables.read(options.file, options.pair)
+    ground = ground_tables.read(options.control)
     return str(options.file), points, ground
 
 

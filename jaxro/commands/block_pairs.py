@@ -25,7 +25,7 @@ def _read(options: request.Options) -> Table:
     assert file is not None
     with say_what(f"Reading {file} ..."):
         if not whole.is_parquet(file):
-            return csv_tables.read(file, options.semicolons)
+            return csv_tables.read(file)
         from ..tables import parquet
 
         source = parquet.Source(file)

@@ -109,7 +109,6 @@ def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
     if options.control is not None:
         points = ground_tables.read(
             options.control,
-            options.measured.semicolons,
             (*ground_tables.ROLES, ground_tables.STATION),
         )
         ground, approximate = _ground(points, options.control_sigma)
@@ -212,8 +211,7 @@ def _bars(options: Options) -> Bars | None:
     """The scale bars. Raises TableError."""
     if options.bars is None:
         return None
-    own = options.measured
-    return bar_tables.read(options.bars, options.control_sigma, own.semicolons)
+    return bar_tables.read(options.bars, options.control_sigma)
 
 
 def _ground(points: GroundPoints, sigma: float | None) -> tuple[Ground, int]:
@@ -261,7 +259,7 @@ def _with_rays(task: Task, options: Options, table: Table, cameras: Cameras) -> 
         ) from None
     if options.rays is None:
         return replace(task, more=block)
-    rows = images.read_places(options.rays, options.measured.semicolons)
+    rows = images.read_places(options.rays)
     places, sigma = _places(rows, cameras, options, task)
     photos = [row.cells["image"] for row in rows]
     for row in rows:

@@ -32,7 +32,6 @@ class Options:
     focal_sigma: float | None = None
     sigma: float | None = None
     y_down: bool | None = None
-    semicolons: bool = False
     distances: bool = False
     own_cameras: bool = False
     separately: bool = False
@@ -185,8 +184,8 @@ def _read(options: Options) -> tuple[str, NamedImages, str]:
             found="no table of the object points",
             expected="--object POINTS.csv with point,X,Y,Z",
         )
-    measured = tables.read_places(options.file, options.semicolons)
-    known = tables.read_points(options.object, options.semicolons)
+    measured = tables.read_places(options.file)
+    known = tables.read_points(options.object)
     named = tables.assemble(measured, known)
     return str(options.file), named, str(options.object)
 

@@ -57,7 +57,7 @@ def read_wanted(options: Options, named: NamedImages) -> Wanted | None:
         raise TableError(
             "--pair", found="it without IMAGE.csv", expected="a table with two images"
         )
-    rows = tables.read_places(path, options.semicolons)
+    rows = tables.read_places(path)
     if named.is_single and "image" not in rows[0].cells:
         rows = [
             row._replace(cells=row.cells | {"image": named.images[0]}) for row in rows

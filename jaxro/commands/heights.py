@@ -30,7 +30,6 @@ class Options:
     deviations: list[str]
     out: Path | None
     force: bool
-    semicolons: bool = False
     documents: Documents = NO_DOCUMENTS
 
     @property
@@ -131,12 +130,11 @@ def prepare(options: Options) -> Named:
             ("--base", options.base),
         )
     )
-    semicolons = options.semicolons
-    readings = tables.read(options.file, tables.READINGS, semicolons)
-    grid = tables.read(options.grid, tables.GRID, semicolons)
+    readings = tables.read(options.file, tables.READINGS)
+    grid = tables.read(options.grid, tables.GRID)
     traverses = None
     if options.traverses is not None:
-        traverses = tables.read(options.traverses, tables.TRAVERSES, semicolons)
+        traverses = tables.read(options.traverses, tables.TRAVERSES)
     return tables.assemble(readings, grid, traverses, camera_height, base, deviations)
 
 

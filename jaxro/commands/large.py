@@ -213,20 +213,15 @@ def _plan(
     assert options.file is not None and options.out is not None
     inputs = whole.Inputs(options.file, options.camera)
     source, digest = options.file, None
-    if whole.is_parquet(source):
-        if options.semicolons:
-            raise TableError(
-                "--semicolons", found="it with a Parquet table", expected="a CSV table"
-            )
-    else:
+    if not whole.is_parquet(source):
         source = folder / CONVERTED
         before = previous_request(folder).get(CONVERSION) if large.resume else None
         digest = file_digest(source) if before and source.exists() else None
         if digest is None or digest != before:
             folder.mkdir(parents=True, exist_ok=True)
-            convert(options.file, source, options.semicolons)
+            convert(options.file, source)
             digest = file_digest(source)
-    table = parquet.Source(source, options.file, options.semicolons)
+    table = parquet.Source(source, options.file)
     system = SYSTEMS[options.elements or "relative"]
     check_numbers(options, table.has_sigma, str(options.file), system)
     known = table.has_sigma or options.sigma is not None
@@ -360,7 +355,6 @@ def _request(
         "elements",
         "base",
         "residual",
-        "semicolons",
     }
     asked |= {name: _plain(getattr(options, name)) for name in sorted(named | {"unit"})}
     asked["elements"] = options.elements or "relative"

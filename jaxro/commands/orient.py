@@ -133,7 +133,7 @@ def _read(options: Options, otherwise: Example) -> tuple[Options, Table, Cameras
     with say_what(f"Reading {options.file} ..."):
         if other_programs.is_asked(options):
             return other_programs.read(options)
-        table = tables.read(options.file, options.semicolons)
+        table = tables.read(options.file)
     return options, table, read_cameras(options, otherwise)
 
 

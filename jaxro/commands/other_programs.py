@@ -26,7 +26,6 @@ def read(options: Options) -> tuple[Options, Table, Cameras]:
         "--principal-point": options.principal_point is not None,
         "--pixel-size": options.pixel_size is not None,
         "--y-down": options.y_down,
-        "--semicolons": options.semicolons,
     }
     for name, given in beside.items():
         if given:

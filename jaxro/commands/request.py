@@ -46,7 +46,6 @@ class Options:
     out: Path | None = None
     force: bool = False
     confidence: float | None = None
-    semicolons: bool = False
     documents: Documents = NO_DOCUMENTS
     g2o: Path | None = None
 

@@ -179,7 +179,6 @@ def _standard(options: Options) -> dict[str, Pair]:
         ("--principal-point", options.principal_point),
         ("--pixel-size", options.pixel_size),
         ("--y-down", options.y_down or None),
-        ("--semicolons", options.semicolons or None),
         ("--unit", None if options.unit == "mm" else options.unit),
     ):
         if value is not None:

@@ -78,7 +78,12 @@ def csv_text(rows: Iterable[Sequence[Any]]) -> str:
 
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerows(map(cell, row) for row in rows)
+    quoting = csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL)
+    for row in rows:
+        cells = [cell(value) for value in row]
+        # this one line end csv leaves without quotes
+        ends = any(isinstance(value, str) and "\r" in value for value in cells)
+        (quoting if ends else writer).writerow(cells)
     return text.getvalue()
 
 

@@ -18,17 +18,17 @@ from .survey_checks import Row
 BARS = Columns(("from", "to", "length"), ("sigma",), texts=("from", "to"))
 
 
-def read(path: Path, sigma: float | None, semicolons: bool = False) -> Bars:
-    """The bars of a file; `sigma`: of all lengths where the table has no column of it;
-    `semicolons` as in `fields.lines_of`. Raises TableError."""
-    return parse(fields.read_text(path), str(path), sigma, semicolons)
+def read(path: Path, sigma: float | None) -> Bars:
+    """The bars of a file; `sigma`: of all lengths where the table has no column of it.
+    Raises TableError."""
+    return parse(fields.read_text(path), str(path), sigma)
 
 
-def parse(text: str, file: str, sigma: float | None, semicolons: bool = False) -> Bars:
+def parse(text: str, file: str, sigma: float | None) -> Bars:
     """The bars of CSV text. Raises TableError."""
     rows, line = [], 1
     given = io.StringIO(text, newline="")
-    for line, cells in fields.lines_of(given, file, BARS, semicolons):
+    for line, cells in fields.lines_of(given, file, BARS):
         row = Row(file, line, dict(cells))
         ends = [fields.name(cells[c], file, line, c) for c in ("from", "to")]
         if ends[0] == ends[1]:

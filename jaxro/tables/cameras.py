@@ -21,6 +21,12 @@ from .fields import TableError, read_text
 from .measured import CameraPairs, Measurements, of_pairs, one_pair, to_list, to_ragged
 
 KEYS = ("focal", "principal_point", "pixel_size", "y_down")
+LARGEST = 1_000_000
+"""Bytes of a camera file: those of some 20,000 photos, read in seconds."""
+
+DOTS = 20
+"""Points in a line of a camera file: those of a name and of two numbers."""
+
 FORMS = "[camera], or [left] and [right], or [photo.NAME] for every photo"
 
 
@@ -48,35 +54,35 @@ class Cameras:
     ) -> tuple[str, str]:
         """The two photos that the name of a pair is made of: LEFT-RIGHT or LEFT_RIGHT,
         of photos that have a camera of their own. Raises TableError."""
-        splits = [
-            (name[:i], name[i + 1 :])
-            for i, letter in enumerate(name)
-            if letter in "-_" and 0 < i < len(name) - 1
-        ]
+        marks = [k for k in range(1, len(name) - 1) if name[k] in "-_"]
         if self.photos:
-            known = [s for s in splits if all(photo in self.photos for photo in s)]
+            known = [
+                k
+                for k in marks
+                if name[:k] in self.photos and name[k + 1 :] in self.photos
+            ]
             expected = (
                 f"LEFT-RIGHT or LEFT_RIGHT with two photos of {self.file}: "
                 f"{', '.join(self.photos)}"
             )
         else:
             # photo_1-photo_2 has one hyphen
-            known = [
-                s for s in splits if name.count("-") == 1 and "-" not in s[0] + s[1]
-            ]
-            known = known or splits
+            hyphens = [k for k in marks if name[k] == "-"]
+            known = hyphens if name.count("-") == 1 and hyphens else marks
             expected = (
                 "LEFT-RIGHT, the names of two photos, or the columns left and right "
                 "with these names"
             )
-        if len(known) != 1 or known[0][0] == known[0][1]:
+        if len(known) == 1:
+            left, right = name[: known[0]], name[known[0] + 1 :]
+        if len(known) != 1 or left == right:
             found = repr(name)
             if len(known) > 1:
                 found += f", which can be split in {len(known)} ways"
             raise TableError(
                 file, line=line, column="pair", found=found, expected=expected
             )
-        return known[0]
+        return left, right
 
     def of_photo(self, name: str) -> Camera | None:
         """The camera of a photo; None where it has none, or not one alone."""
@@ -167,17 +173,30 @@ def _at(error: TableError, line: int | str | None) -> TableError:
 
 def read(path: Path) -> Cameras:
     """The cameras of a TOML file. Raises TableError."""
-    text = read_text(path)
+    text = read_text(path, LARGEST)
+    _check_dots(path, text)
     try:
         return _cameras(path, text, tomllib.loads(text))
     except TableError:
         raise
-    except ValueError as error:  # also of whole numbers with thousands of digits
+    except tomllib.TOMLDecodeError as error:
         line = re.search(r"at line (\d+)", str(error))
         where, found = int(line[1]) if line else None, f"no valid TOML ({error})"
+    except ValueError:  # Python refuses them
+        where, found = None, "a whole number of thousands of digits"
     except RecursionError:
         where, found = None, "lists or tables within each other, too deep to be read"
     raise TableError(path, line=where, found=found, expected=f"the tables {FORMS}")
+
+
+def _check_dots(path: Path, text: str) -> None:
+    """Raises TableError for a key of many parts: the reader of TOML takes room by the
+    square of their number."""
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.count(".") > DOTS and not line.lstrip().startswith("#"):
+            found = f"a line with {line.count('.')} points"
+            expected = "a key, or a table, of a camera"
+            raise TableError(path, line=number, found=found, expected=expected)
 
 
 def _cameras(path: Path, text: str, tables: dict[str, Any]) -> Cameras:
@@ -214,19 +233,14 @@ def _camera(path: Path, text: str, table: str, entries: Any) -> Camera:
             expected=f"a table [{table}] with {', '.join(KEYS)}",
         )
     for key, value in entries.items():
-        line, place = _line(text, table, key), f"{table}.{key}"
-        if key not in KEYS:
-            raise TableError(
-                path,
-                line=line,
-                column=place,
-                found="an unknown key",
-                expected=f"{', '.join(KEYS)}; none is ignored",
-            )
         good, expected = _fits(key, value)
         if not good:
             raise TableError(
-                path, line=line, column=place, found=repr(value), expected=expected
+                path,
+                line=_line(text, table, key),
+                column=f"{table}.{key}",
+                found=repr(value) if key in KEYS else "an unknown key",
+                expected=expected,
             )
     if "focal" not in entries:
         raise TableError(
@@ -248,6 +262,8 @@ def _camera(path: Path, text: str, table: str, entries: Any) -> Camera:
 def _fits(key: str, value: Any) -> tuple[bool, str]:
     """Whether a value suits its key, and what would."""
     number = lambda v: type(v) in (int, float) and abs(v) <= sys.float_info.max
+    if key not in KEYS:
+        return False, f"{', '.join(KEYS)}; none is ignored"
     if key == "y_down":
         return isinstance(value, bool), "true or false"
     if key == "principal_point":

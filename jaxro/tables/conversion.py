@@ -13,34 +13,35 @@ import numpy as np
 import pyarrow.csv as arrow_csv
 
 from . import csv as tables, whole
+from .fields import find_separator
 from .measured import COLUMNS, COVARIANCES, DEVIATIONS, PHOTOS, check_accuracy
 from .parquet import BATCH, NAMES, encoding, pa, pc, pq
 
 
-def convert(source: Path, target: Path, semicolons: bool = False) -> None:
-    """A CSV table as a Parquet table, in bounded memory; `semicolons` as in
-    `fields.lines_of`. Raises TableError with line and column."""
+def convert(source: Path, target: Path) -> None:
+    """A CSV table as a Parquet table, in bounded memory. Raises TableError with line and
+    column."""
     with whole.draft_of(target) as draft:
-        try:
-            _convert_quickly(source, draft, semicolons)
-        except (pa.ArrowInvalid, pa.ArrowKeyError):
-            # or says what is wrong where
-            _convert_carefully(source, draft, semicolons)
+        for point in ".,":
+            with suppress(pa.ArrowInvalid, pa.ArrowKeyError):
+                return _convert_quickly(source, draft, point)
+        # or says what is wrong where
+        _convert_carefully(source, draft)
 
 
-def _convert_quickly(source: Path, draft: Path, semicolons: bool) -> None:
-    """By Arrow, which is to find what `tables` would. Raises ArrowInvalid where it
-    might not."""
-    line, header = 1, []
-    separator, point = (";", ",") if semicolons else (",", ".")
+def _convert_quickly(source: Path, draft: Path, point: str) -> None:
+    """By Arrow, which is to find what `tables` would, with this decimal point. Raises
+    ArrowInvalid where it might not."""
+    line, header, separator = 1, [], ","
     with (
         suppress(OSError, UnicodeDecodeError, csv.Error),
         source.open(encoding="utf-8-sig", newline="") as file,
     ):
-        rows = csv.reader(file, delimiter=separator, skipinitialspace=True)
+        separator, lines = find_separator(file)
+        rows = csv.reader(lines, delimiter=separator, skipinitialspace=True)
         header = next((row for row in rows if any(entry.strip() for entry in row)), [])
         line = rows.line_num
-    if not header or _odd(source, separator):
+    if not header or point == separator or _odd(source, separator):
         raise pa.ArrowInvalid("for the careful reader")
     COLUMNS.places(header, str(source), line)
     check_accuracy([COLUMNS.full(name) for name in header], str(source))
@@ -74,9 +75,9 @@ def _convert_quickly(source: Path, draft: Path, semicolons: bool) -> None:
         raise pa.ArrowInvalid("no rows")
 
 
-def _convert_carefully(source: Path, draft: Path, semicolons: bool) -> None:
+def _convert_carefully(source: Path, draft: Path) -> None:
     """Line by line, a tenth as fast. Raises TableError."""
-    lines, writer = tables.lines(source, semicolons), None
+    lines, writer = tables.lines(source), None
     while rows := list(islice(lines, BATCH)):
         _, pairs, points, values, photos, names = zip(*rows, strict=True)
         columns = {"pair": pairs} if pairs[0] else {}

@@ -43,13 +43,13 @@ class Line(NamedTuple):
     columns: tuple[str, ...]
 
 
-def read(path: Path, semicolons: bool = False) -> Table:
+def read(path: Path) -> Table:
     """The pairs of a CSV file; without a column `pair` one pair, named after the file.
-    `semicolons` as in `fields.lines_of`. Raises TableError."""
-    return parse(read_text(path), str(path), path.stem, semicolons)
+    Raises TableError."""
+    return parse(read_text(path), str(path), path.stem)
 
 
-def parse(text: str, file: str, name: str, semicolons: bool = False) -> Table:
+def parse(text: str, file: str, name: str) -> Table:
     """The pairs of CSV text. `file` is named in errors, `name` is the pair's where the
     table has no column `pair`."""
     line = 1
@@ -58,7 +58,7 @@ def parse(text: str, file: str, name: str, semicolons: bool = False) -> Table:
     places: dict[tuple, str] = {}
     twins: dict[str, list[str]] = {}
     for line, pair, point, values, photos, columns in check_lines(
-        io.StringIO(text, newline=""), file, name, semicolons
+        io.StringIO(text, newline=""), file, name
     ):
         first = seen.setdefault(pair, {}).setdefault(point, line)
         if first != line:
@@ -104,19 +104,17 @@ def no_points(file: str, line: int) -> TableError:
     )
 
 
-def lines(path: Path, semicolons: bool = False) -> Iterator[Line]:
+def lines(path: Path) -> Iterator[Line]:
     """The `check_lines` lines of a file, one at a time. Raises TableError."""
     text = fields.text_lines(path)
-    yield from check_lines(text, str(path), semicolons=semicolons)
+    yield from check_lines(text, str(path))
 
 
-def check_lines(
-    text: Iterable[str], file: str, name: str = "", semicolons: bool = False
-) -> Iterator[Line]:
+def check_lines(text: Iterable[str], file: str, name: str = "") -> Iterator[Line]:
     """Every line below the header, each field looked at; `name`: of the pair, where the
     table has neither a column for it nor for its photos. Raises TableError."""
     columns: tuple[str, ...] = ()
-    for line, cells in fields.lines_of(text, file, COLUMNS, semicolons):
+    for line, cells in fields.lines_of(text, file, COLUMNS):
         if not columns:
             check_accuracy(tuple(cells), file)
             columns = tuple(name for name in NUMBERS if name in cells)

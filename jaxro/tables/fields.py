@@ -7,6 +7,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 MOST_FOUND = 200
@@ -92,13 +93,12 @@ class Columns:
 
     def places(self, header: list[str], file: str, line: int | None) -> dict[str, int]:
         """The place of every column by its full name. Raises TableError."""
-        if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-            expected = (
-                "fields separated by commas, decimals by points; or --semicolons where "
-                "fields are separated by semicolons"
-            )
+        if len(header) == 1 and any(mark in header[0].strip() for mark in " |:"):
             raise TableError(
-                file, line=line, found=f"the header {header[0]!r}", expected=expected
+                file,
+                line=line,
+                found=f"the header {header[0]!r}",
+                expected="fields separated by commas, semicolons or tabs",
             )
         places: dict[str, int] = {}
         for place, entry in enumerate(header):
@@ -138,11 +138,12 @@ class Columns:
         return places
 
 
-def read_text(path: Path) -> str:
-    """The UTF-8 text of a file. Raises TableError if it cannot be read or is not
-    UTF-8."""
+def read_text(path: Path, most: int = -1) -> str:
+    """The UTF-8 text of a file. Raises TableError if it cannot be read, is not UTF-8, or
+    has more than `most` bytes."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(most if most < 0 else most + 1)
     except OSError as error:
         expected = "a readable file; check the path and its permissions"
         raise TableError(
@@ -150,6 +151,12 @@ def read_text(path: Path) -> str:
             found=f"no file that can be read ({error.strerror or error})",
             expected=expected,
         ) from None
+    if 0 <= most < len(data):
+        raise TableError(
+            path,
+            found=f"more than {most / 1e6:g} million bytes",
+            expected="a smaller file; is it the one that is meant?",
+        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -173,16 +180,29 @@ def text_lines(path: Path) -> Iterator[str]:
         read_text(path)  # says which
 
 
+def find_separator(text: Iterable[str]) -> tuple[str, Iterator[str]]:
+    """What separates the fields of a table, and its lines: the semicolon or the tab that
+    its header has, which no column has in its name, or else the comma."""
+    lines, first = iter(text), []
+    for line in lines:
+        first.append(line)
+        if any(letter.isalnum() for letter in line):
+            break
+    header = first[-1] if first else ""
+    return next((mark for mark in ";\t" if mark in header), ","), chain(first, lines)
+
+
 def lines_of(
-    text: Iterable[str], file: str, columns: Columns, semicolons: bool = False
+    text: Iterable[str], file: str, columns: Columns
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """(line number, fields by the full names of their columns) of every line that is
     not blank. Raises TableError.
 
-    `semicolons`: they separate the fields, and decimals may be written with a comma,
+    Where semicolons or tabs separate the fields, decimals may be written with a comma,
     which becomes a point.
     """
-    rows = _rows(text, file, ";" if semicolons else ",")
+    separator, lines = find_separator(text)
+    rows = _rows(lines, file, separator)
     line, header = next(rows, (1, None))
     if header is None:
         raise TableError(
@@ -205,13 +225,13 @@ def lines_of(
         if len(row) > len(places):
             expected = (
                 f"{len(places)}, as in the header; names that hold a separator stand "
-                "in quotes, decimals are written with a point (or --semicolons)"
+                "in quotes; decimals with a comma need semicolons or tabs between fields"
             )
             raise TableError(
                 file, line=line, found=f"{len(row)} fields", expected=expected
             )
         cells = {name: row[place].strip() for name, place in places.items()}
-        if semicolons:
+        if separator != ",":
             for column in cells.keys() - columns.texts:
                 cells[column] = _with_point(cells[column])
         yield line, cells

@@ -67,18 +67,15 @@ class GroundPoints:
         )
 
 
-def read(
-    path: Path, semicolons: bool = False, roles: tuple[str, ...] = ROLES
-) -> GroundPoints:
-    """The points of a file, and stations if their role is one of `roles`; `semicolons`
-    as in `fields.lines_of`. Raises TableError."""
-    return parse(fields.read_text(path), str(path), semicolons, roles)
+def read(path: Path, roles: tuple[str, ...] = ROLES) -> GroundPoints:
+    """The points of a file, and stations if their role is one of `roles`. Raises
+    TableError."""
+    return parse(fields.read_text(path), str(path), roles)
 
 
 def parse(
     text: str,
     file: str,
-    semicolons: bool = False,
     roles: tuple[str, ...] = ROLES,
 ) -> GroundPoints:
     """The points of CSV text. Raises TableError."""
@@ -86,7 +83,7 @@ def parse(
     first: dict[tuple[str, bool], int] = {}
     line = 1
     given = io.StringIO(text, newline="")
-    for line, cells in fields.lines_of(given, file, GROUND, semicolons):
+    for line, cells in fields.lines_of(given, file, GROUND):
         row = Row(file, line, dict(cells))
         if not rows:
             _check_columns(row)

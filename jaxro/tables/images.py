@@ -81,22 +81,22 @@ class NamedImages:
         return [self.points[k] for k in self.point[rows]]
 
 
-def read_places(path: Path, semicolons: bool = False) -> list[Row]:
+def read_places(path: Path) -> list[Row]:
     """The places of a file; without a column `image` they are those of one image, named
     after the file. Raises TableError."""
-    return places(fields.read_text(path), str(path), path.stem, semicolons)
+    return places(fields.read_text(path), str(path), path.stem)
 
 
-def read_points(path: Path, semicolons: bool = False) -> list[Row]:
+def read_points(path: Path) -> list[Row]:
     """The object points of a file. Raises TableError."""
-    return points(fields.read_text(path), str(path), semicolons)
+    return points(fields.read_text(path), str(path))
 
 
-def places(text: str, file: str, image: str, semicolons: bool = False) -> list[Row]:
+def places(text: str, file: str, image: str) -> list[Row]:
     """The places of CSV text; `image`: the name of the image where the text has none.
     Raises TableError."""
     rows, seen = [], {}
-    for row in _rows(text, file, PLACES, semicolons):
+    for row in _rows(text, file, PLACES):
         of = row.cells.setdefault("image", image)
         for column in TEXTS:
             if column in row.cells:
@@ -119,10 +119,10 @@ def places(text: str, file: str, image: str, semicolons: bool = False) -> list[R
     return rows
 
 
-def points(text: str, file: str, semicolons: bool = False) -> list[Row]:
+def points(text: str, file: str) -> list[Row]:
     """The object points of CSV text. Raises TableError."""
     rows, seen = [], {}
-    for row in _rows(text, file, POINTS, semicolons):
+    for row in _rows(text, file, POINTS):
         name = fields.name(row.cells["point"], file, row.line, "point")
         if name in seen:
             raise row.error(
@@ -294,11 +294,11 @@ def check_seen(named: NamedImages) -> None:
         )
 
 
-def _rows(text: str, file: str, columns: Columns, semicolons: bool) -> list[Row]:
+def _rows(text: str, file: str, columns: Columns) -> list[Row]:
     """The lines of CSV text as they are written. Raises TableError."""
     given = io.StringIO(text, newline="")
     found, line = [], 1
-    for line, cells in fields.lines_of(given, file, columns, semicolons):
+    for line, cells in fields.lines_of(given, file, columns):
         found.append(Row(file, line, dict(cells)))
     if not found:
         raise TableError(

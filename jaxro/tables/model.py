@@ -39,10 +39,10 @@ class ModelPoints:
     lines: Int[np.ndarray, " point"]
 
 
-def read(path: Path, pair: str | None = None, semicolons: bool = False) -> ModelPoints:
+def read(path: Path, pair: str | None = None) -> ModelPoints:
     """The model of a file, or that of a `pair` where there are several. Raises
     TableError."""
-    return parse(fields.read_text(path), str(path), path.stem, pair, semicolons)
+    return parse(fields.read_text(path), str(path), path.stem, pair)
 
 
 def parse(
@@ -50,16 +50,15 @@ def parse(
     file: str,
     name: str,
     pair: str | None = None,
-    semicolons: bool = False,
 ) -> ModelPoints:
     """The model of CSV text; `name`: its name where the table has no column pair.
     Raises TableError."""
-    columns, unit = _columns(text, ";" if semicolons else ",")
+    columns, unit = _columns(text)
     models: dict[str, dict[str, tuple[int, list[float]]]] = {}
     there: tuple[str, ...] = ()
     line = 1
     given = io.StringIO(text, newline="")
-    for line, cells in fields.lines_of(given, file, columns, semicolons):
+    for line, cells in fields.lines_of(given, file, columns):
         there = tuple(column for column in NUMBERS if column in cells)
         own = cells.get("pair", name)
         if "pair" in cells:
@@ -101,9 +100,10 @@ def parse(
     )
 
 
-def _columns(text: str, separator: str) -> tuple[Columns, str]:
+def _columns(text: str) -> tuple[Columns, str]:
     """The columns of a table with this header, and the unit that this says."""
-    lines = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+    separator, given = fields.find_separator(io.StringIO(text, newline=""))
+    lines = csv.reader(given, delimiter=separator)
     header = next((row for row in lines if any(e.strip() for e in row)), [])
     short, units = dict(SHORT), []
     for entry in header:

@@ -53,11 +53,11 @@ class Scan(NamedTuple):
 class Source:
     """A Parquet table of measured points. Raises TableError where it is none.
 
-    `told`: the CSV table of which it is made, with `semicolons` or without.
+    `told`: the CSV table of which it is made.
     """
 
-    def __init__(self, path: Path, told: Path | None = None, semicolons: bool = False):
-        self.path, self._own, self._semicolons = told or path, path, semicolons
+    def __init__(self, path: Path, told: Path | None = None):
+        self.path, self._own = told or path, path
         self._converted = self.path != path
         try:
             self._file = pq.ParquetFile(path, pre_buffer=False)
@@ -180,7 +180,7 @@ class Source:
         """How a row is told of: by its line where the table has been converted."""
         if not self._converted:
             return f"row {row + 1}"
-        line, *_ = next(islice(tables.lines(self.path, self._semicolons), row, None))
+        line, *_ = next(islice(tables.lines(self.path), row, None))
         return f"line {line}"
 
     def read(self, begins: np.ndarray) -> Table:

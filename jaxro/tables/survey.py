@@ -48,12 +48,12 @@ class Named:
     places: np.ndarray | None
 
 
-def rows(text: str, file: str, columns: Columns, semicolons: bool = False) -> list[Row]:
-    """The lines of CSV text by the names of its columns; `semicolons` as in
-    `fields.lines_of`. Raises TableError."""
+def rows(text: str, file: str, columns: Columns) -> list[Row]:
+    """The lines of CSV text by the names of its columns. Raises
+    TableError."""
     found, line = [], 1
     given = io.StringIO(text, newline="")
-    for line, entries in fields.lines_of(given, file, columns, semicolons):
+    for line, entries in fields.lines_of(given, file, columns):
         row = Row(file, line, {})
         for column, entry in entries.items():
             row.cells[column] = _cell(entry, row, column, column in columns.optional)
@@ -78,9 +78,9 @@ def _cell(entry: str, row: Row, column: str, optional: bool) -> Any:
     return value
 
 
-def read(path: Path, columns: Columns, semicolons: bool = False) -> list[Row]:
+def read(path: Path, columns: Columns) -> list[Row]:
     """The lines of a file. Raises TableError."""
-    return rows(fields.read_text(path), str(path), columns, semicolons)
+    return rows(fields.read_text(path), str(path), columns)
 
 
 def assemble(

@@ -317,23 +317,20 @@ def test_a_fork_after_the_first_call_is_told(tmp_path):
     assert done.stdout.split() == ["True", "True"], done.stderr
 
 
-def test_semicolons_and_decimal_commas(table, tmp_path):
+def test_decimal_commas(table, tmp_path):
     spread = tmp_path / "spread.csv"
     header, *points = pair_example.TABLE.strip().splitlines()
     lines = [header.replace(",", ";")]
     lines += [line.replace(",", ";").replace(".", ",") for line in points]
     spread.write_text("\n".join(lines))
-    refused = run(spread, *FOCAL)
-    assert refused.exit_code == 2 and "--semicolons" in refused.output
     for more in ([], ["--parquet"]):
-        outs = [tmp_path / f"{name}{len(more)}" for name in ("comma", "semicolon")]
+        outs = [tmp_path / f"{name}{len(more)}" for name in ("comma", "other")]
         assert run(table, *FOCAL, "--out", outs[0], *more).exit_code == 0
-        arguments = (spread, *FOCAL, "--out", outs[1], *more, "--semicolons")
+        arguments = (spread, *FOCAL, "--out", outs[1], *more)
         assert run(*arguments).exit_code == 0
         if more:
             summaries = [json.loads((out / "summary.json").read_text()) for out in outs]
             assert summaries[0]["results"] == summaries[1]["results"]
-            assert [s["semicolons"] for s in summaries] == [False, True]
         else:
             texts = [(out / "points.csv").read_text() for out in outs]
             assert texts[0].replace("\npair,", "\nspread,") == texts[1]

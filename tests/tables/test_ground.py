@@ -38,7 +38,7 @@ def test_ground_points_become_numbers_with_roles(tmp_path):
     np.testing.assert_array_equal(read.lines, [2, 3, 4, 5])
 
     path = write(tmp_path, "point;X;Y;Z;sigma\nq;1,5;;2;0,5\n", "ground.csv")
-    one = ground.read(path, semicolons=True)
+    one = ground.read(path)
     np.testing.assert_array_equal(one.coordinates, [[1.5, nan, 2.0]])
     np.testing.assert_array_equal(one.deviations, [[0.5, nan, 0.5]])
     plain = ground.parse("point,X,Y,Z\nq,1,2,3\n", "ground.csv")

@@ -47,7 +47,7 @@ def test_both_tables_become_numbers_with_names(tmp_path):
     assert named.has_deviations and not named.is_single
 
     path = write(tmp_path, "point;x;y\na;1,5;2\n", "photo 7.csv")
-    (row,) = tables.read_places(path, semicolons=True)
+    (row,) = tables.read_places(path)
     assert row.cells == {"point": "a", "x": 1.5, "y": 2.0, "image": "photo 7"}
     one = tables.assemble([row], tables.points("point,X,Y,Z\na,1,2,3\n", "points.csv"))
     assert one.is_single and one.sigma is None and not one.has_deviations

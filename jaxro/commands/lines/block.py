@@ -166,7 +166,6 @@ def block(
     principal_point: given.PrincipalPoint = None,
     pixel_size: given.PixelSize = None,
     y_down: given.YDown = False,
-    semicolons: given.Semicolons = False,
     sigma: Sigma = None,
     inner: InnerNames = None,
     components: Components = False,
@@ -207,7 +206,6 @@ def block(
         out=out,
         force=force,
         documents=Documents(report, plots, json, force),
-        semicolons=semicolons,
     )
     options = Options(
         measured=measured,

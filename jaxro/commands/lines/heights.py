@@ -25,7 +25,6 @@ def heights(
     camera_height: given.CameraHeight = None,
     base: given.HorizontalBase = None,
     sd: given.Deviation = None,
-    semicolons: given.Semicolons = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -61,7 +60,6 @@ def heights(
                 out=out,
                 force=force,
                 documents=Documents(report, plots, json, force),
-                semicolons=semicolons,
             )
         )
     )

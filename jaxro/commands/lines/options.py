@@ -99,13 +99,6 @@ PixelSize = Annotated[
 YDown = Annotated[
     bool, typer.Option("--y-down", help="y of the table counts downwards.")
 ]
-Semicolons = Annotated[
-    bool,
-    typer.Option(
-        "--semicolons",
-        help="Tables have semicolons between fields, and decimals with a comma.",
-    ),
-]
 Sigma = Annotated[
     str | None,
     typer.Option(

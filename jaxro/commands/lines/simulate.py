@@ -36,7 +36,6 @@ def compare(
     principal_point: given.PrincipalPoint = None,
     pixel_size: given.PixelSize = None,
     y_down: given.YDown = False,
-    semicolons: given.Semicolons = False,
     sigma: Annotated[
         float | None,
         typer.Option(
@@ -82,7 +81,6 @@ def compare(
         principal_point=principal_point,
         pixel_size=pixel_size,
         y_down=y_down,
-        semicolons=semicolons,
         sigma=sigma,
         unit=unit,
     )
