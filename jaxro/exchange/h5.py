@@ -9,18 +9,67 @@ Whatever else a group holds (R, t, ...) is not read. Links lead within the file 
 Needs the extra `h5`; of cameras with distortion also `colmap`.
 """
 
+import io
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from ..tables.fields import TableError
-from . import colmap_cameras, pixels
-from .hdf5 import Entries
+from . import colmap_cameras, h5_child, pixels
 from .matches import FARTHEST, LEAST, Match, Matches, Seen, collect, is_focal
 
 PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
 """Models without distortion, and how many parameters they have."""
+
+PATIENCE = 10
+"""How much longer than its time of a processor a file may take on a busy computer."""
+
+EXPECTED = "a file with a group for each pair"
+
+
+class _Held(NamedTuple):
+    """What a file holds: `holds` lists the entries of groups, `values` are those of the
+    others, both by their place, in which a pair is its number: 0/camera1/params."""
+
+    path: str | Path
+    holds: Mapping[str, list[str]]
+    values: Mapping[str, np.ndarray]
+
+    def place(self, key: str) -> str:
+        """How a place is told: by the name of the pair."""
+        number, *rest = key.split("/")
+        return "/".join([self.holds[""][int(number)], *rest])
+
+    def is_there(self, key: str) -> bool:
+        """Whether there is an entry, a group or values."""
+        return key in self.holds or key in self.values
+
+    def missing(self, key: str, expected: str) -> TableError:
+        """The error that an entry is not there."""
+        group = key.rpartition("/")[0]
+        holds = ", ".join(self.holds.get(group, ["numbers"])) or "nothing"
+        return self.error(key, f"no such entry, but {holds}", expected)
+
+    def numbers(self, key: str) -> np.ndarray:
+        """Real numbers. Raises TableError."""
+        if key not in self.values:
+            raise self.error(key, "a group", "numbers")
+        values = self.values[key]
+        if values.dtype.kind not in "fiu":
+            raise self.error(key, f"values of type {values.dtype}", "numbers")
+        return np.asarray(values, float)
+
+    def error(self, key: str, found: str, expected: str) -> TableError:
+        """The error at a place."""
+        column = self.place(key)
+        return TableError(self.path, column=column, found=found, expected=expected)
 
 
 def read_h5(path: str | Path, *, sigma: float | None = None) -> Matches:
@@ -31,49 +80,70 @@ def read_h5(path: str | Path, *, sigma: float | None = None) -> Matches:
     The photos are those of the pair alone, NAME:1 and NAME:2, and its points have names
     of their own: such a file does not say which points of two pairs are one.
     """
-    warnings: list[str] = []
-    with Entries(path) as entries:
-        pairs = [
-            _read_pair(entries, number, name, warnings)
-            for number, name in enumerate(entries.names(entries.root, None), 1)
-        ]
+    held, warnings = _read(path), []
+    pairs = [_read_pair(held, k, warnings) for k in range(len(held.holds[""]))]
     if not pairs:
         raise TableError(path, found="no groups", expected="a group for each pair")
     return collect(str(path), pairs, sigma, warnings)
 
 
-def _read_pair(entries: Entries, number: int, name: str, warnings: list[str]) -> Match:
+def _read(path: str | Path) -> _Held:
+    """What the file holds, by a process that may fail (`h5_child`). Raises TableError."""
+    if find_spec("h5py") is None:
+        raise SystemExit("HDF5 files need h5py: pip install 'jaxro[h5]'")
+    try:
+        most = h5_child.SECONDS + os.stat(path).st_size // h5_child.SPEED
+        line = [sys.executable, "-P", h5_child.__file__, os.fspath(path)]
+        done = subprocess.run(
+            line, capture_output=True, timeout=PATIENCE * most, check=False
+        )
+    except OSError as error:
+        found = f"no file that can be read ({error.strerror or error})"
+        raise TableError(path, found=found, expected=EXPECTED) from None
+    except subprocess.TimeoutExpired:
+        found = f"damaged bytes: reading takes more than {PATIENCE * most} seconds"
+        raise TableError(path, found=found, expected=EXPECTED) from None
+    if done.returncode == h5_child.REFUSED:
+        place, found, expected = json.loads(done.stderr)
+        raise TableError(path, column=place, found=found, expected=expected)
+    if done.returncode:
+        found = f"damaged bytes, at which reading ended (code {done.returncode})"
+        raise TableError(path, found=found, expected=EXPECTED)
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as values:
+        loaded = {key: values[key] for key in values.files}
+    return _Held(path, json.loads(str(loaded.pop("holds"))), loaded)
+
+
+def _read_pair(held: _Held, number: int, warnings: list[str]) -> Match:
     """One pair. Raises TableError."""
-    group = entries.find(entries.root, name, name)
-    expected = "x1, x2, camera1 and camera2 in the group of each pair"
-    parts = [
-        _find(entries, group, name, part, expected)
-        for part in ("x1", "x2", "camera1", "camera2")
-    ]
-    places = [
-        _read_pixels(entries, part, f"{name}/x{k}")
-        for k, part in enumerate(parts[:2], 1)
-    ]
+    name = held.holds[""][number]
+    for entry in h5_child.PAIR:
+        if not held.is_there(f"{number}/{entry}"):
+            raise held.missing(
+                f"{number}/{entry}",
+                "x1, x2, camera1 and camera2 in the group of each pair",
+            )
+    places = [_read_pixels(held, f"{number}/{x}") for x in ("x1", "x2")]
     if len(places[0]) != len(places[1]):
-        raise entries.error(
-            f"{name}/x2",
+        raise held.error(
+            f"{number}/x2",
             f"{len(places[1])} points beside {len(places[0])} in x1",
             "both points of each match in the same row",
         )
     both = [
-        _see(entries, part, f"{name}/camera{k}", places[k - 1])
-        for k, part in enumerate(parts[2:], 1)
+        _see(held, f"{number}/{camera}", pixels)
+        for camera, pixels in zip(("camera1", "camera2"), places, strict=True)
     ]
     (left, focal_left, first), (right, focal_right, second) = both
     seen = first & second
     if not np.all(seen):
         warnings.append(
-            f"{entries.path}: in pair {name!r} {int(np.sum(~seen))} of {len(seen)} "
+            f"{held.path}: in pair {name!r} {int(np.sum(~seen))} of {len(seen)} "
             "matches are left out, which the lens of a photo cannot have seen"
         )
     if np.sum(seen) < LEAST:
         warnings.append(
-            f"{entries.path}: pair {name!r} has {int(np.sum(seen))} matches only"
+            f"{held.path}: pair {name!r} has {int(np.sum(seen))} matches only"
         )
     return Match(
         name=name,
@@ -85,48 +155,31 @@ def _read_pair(entries: Entries, number: int, name: str, warnings: list[str]) ->
     )
 
 
-def _find(entries: Entries, group: Any, place: str, name: str, expected: str) -> Any:
-    """An entry of a group. Raises TableError where there is none."""
-    is_group = hasattr(group, "keys")
-    found = entries.find(group, name, f"{place}/{name}") if is_group else None
-    if found is None:
-        holds = ", ".join(entries.names(group, place)) if is_group else "numbers"
-        raise entries.error(
-            f"{place}/{name}", f"no such entry, but {holds or 'nothing'}", expected
-        )
-    return found
-
-
-def _read_pixels(entries: Entries, entry: Any, place: str) -> pixels.Pixels:
+def _read_pixels(held: _Held, key: str) -> pixels.Pixels:
     """(point, 2) numbers. Raises TableError."""
-    shape = getattr(entry, "shape", None)
-    if shape is None or len(shape) != 2 or shape[1] != 2:
-        found = "a group" if shape is None else f"shape {shape} of type {entry.dtype}"
-        raise entries.error(place, found, "numbers of shape (point, 2)")
-    return entries.numbers(entry, place)
+    numbers = held.numbers(key)
+    if numbers.ndim != 2 or numbers.shape[1] != 2:
+        found = f"shape {numbers.shape} of type {held.values[key].dtype}"
+        raise held.error(key, found, "numbers of shape (point, 2)")
+    return numbers
 
 
 def _see(
-    entries: Entries, entry: Any, place: str, places: pixels.Pixels
+    held: _Held, key: str, places: pixels.Pixels
 ) -> tuple[Seen, float, np.ndarray]:
     """The points in photo coordinates, the focal length, and which of them there are.
     Raises TableError for a camera that is none."""
     try:
-        if not hasattr(entry, "keys"):
-            matrix = entries.numbers(entry, place)
-        else:
-            model = _read_text(entries, entry, place, "model")
-            params = _read_numbers(entries, entry, place, "params")
-            if model not in PINHOLES:
-                camera = colmap_cameras.make_camera(
-                    colmap_cameras.model_of_name(model),
-                    _read_size(entries, entry, place, "width"),
-                    _read_size(entries, entry, place, "height"),
-                    params,
-                )
-                return colmap_cameras.see_by(camera, places)
-            matrix = _pinhole(entries, f"{place}/params", model, params)
-        return _see_by_matrix(places, matrix)
+        if key in held.values:
+            return _see_by_matrix(places, held.numbers(key))
+        model, params = _read_text(held, f"{key}/model"), _read_params(held, key)
+        if model in PINHOLES:
+            matrix = _pinhole(held, f"{key}/params", model, params)
+            return _see_by_matrix(places, matrix)
+        width, height = (_read_size(held, f"{key}/{n}") for n in ("width", "height"))
+        known = colmap_cameras.model_of_name(model)
+        camera = colmap_cameras.make_camera(known, width, height, params)
+        return colmap_cameras.see_by(camera, places)
     except TableError:
         raise
     except ValueError as error:
@@ -135,16 +188,14 @@ def _see(
             "a group with a camera model of COLMAP and its params, or a matrix K of shape "
             "(3, 3)"
         )
-        raise entries.error(place, found, expected) from None
+        raise held.error(key, found, expected) from None
 
 
-def _pinhole(
-    entries: Entries, place: str, model: str, params: np.ndarray
-) -> np.ndarray:
+def _pinhole(held: _Held, key: str, model: str, params: np.ndarray) -> np.ndarray:
     """K of a camera without distortion. Raises TableError."""
     wanted = PINHOLES[model]
     if len(params) != wanted:
-        raise entries.error(place, f"{len(params)} numbers", f"{wanted} for {model}")
+        raise held.error(key, f"{len(params)} numbers", f"{wanted} for {model}")
     fx, fy, cx, cy = (params[0], *params) if wanted == 3 else params
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
@@ -163,48 +214,26 @@ def _see_by_matrix(
     return seen, points.focal, near & seen.usable
 
 
-def _read_value(entries: Entries, group: Any, place: str, key: str) -> Any:
-    """The values of an entry or attribute of a camera, None where there is none."""
-    found = entries.find(group, key, f"{place}/{key}")
-    if found is not None:
-        return entries.values(found, f"{place}/{key}")
-    return entries.attribute(group, key, f"{place}/{key}")
+def _read_params(held: _Held, key: str) -> np.ndarray:
+    """The parameters of a camera. Raises TableError."""
+    if not held.is_there(f"{key}/params"):
+        raise held.missing(f"{key}/params", ", ".join(h5_child.CAMERA))
+    return np.ravel(held.numbers(f"{key}/params"))
 
 
-def _read_numbers(entries: Entries, group: Any, place: str, key: str) -> np.ndarray:
-    """Numbers of a camera in one row. Raises TableError where there are none."""
-    value = _read_value(entries, group, place, key)
-    if value is None:
-        holds = ", ".join(entries.names(group, place)) or "nothing"
-        found = f"no such entry, but {holds}"
-        raise entries.error(f"{place}/{key}", found, "model, width, height and params")
-    numbers = np.ravel(np.asarray(value))
-    if numbers.dtype.kind not in "fiu":
-        found = f"values of type {numbers.dtype}"
-        raise entries.error(f"{place}/{key}", found, "numbers")
-    return numbers.astype(float)
-
-
-def _read_size(entries: Entries, group: Any, place: str, key: str) -> int:
+def _read_size(held: _Held, key: str) -> int:
     """Width or height of a photo, 0 where it is not told. Raises TableError."""
-    if _read_value(entries, group, place, key) is None:
-        return 0
-    numbers = _read_numbers(entries, group, place, key)
+    numbers = np.ravel(held.numbers(key)) if held.is_there(key) else np.zeros(1)
     if len(numbers) != 1 or not 0 <= numbers[0] <= colmap_cameras.LARGEST:
-        found = f"{numbers[:3].tolist()}"
-        raise entries.error(f"{place}/{key}", found, "a number of pixels")
+        raise held.error(key, f"{numbers[:3].tolist()}", "a number of pixels")
     return int(numbers[0])
 
 
-def _read_text(entries: Entries, group: Any, place: str, key: str) -> str:
+def _read_text(held: _Held, key: str) -> str:
     """A name in a camera. Raises TableError where there is none."""
-    value = _read_value(entries, group, place, key)
-    texts = np.ravel(np.asarray(value, object))
-    text = texts[0] if len(texts) == 1 else None
-    if isinstance(text, bytes):
-        text = text.decode(errors="backslashreplace")
-    if not isinstance(text, str):
-        holds = ", ".join(entries.names(group, place)) or "nothing"
-        found = f"no such entry, but {holds}" if value is None else "no text"
-        raise entries.error(f"{place}/{key}", found, "model, width, height and params")
-    return text
+    if not held.is_there(key):
+        raise held.missing(key, ", ".join(h5_child.CAMERA))
+    texts = np.ravel(held.values.get(key, np.zeros(0)))
+    if len(texts) != 1 or texts.dtype.kind != "U":
+        raise held.error(key, "no text", "the name of a camera model")
+    return str(texts[0])
