@@ -6,6 +6,7 @@ import sqlite3
 from contextlib import closing
 
 import pytest
+from mutants import mutants
 
 from jaxro.tables import cameras, csv as tables
 from jaxro.tables.examples import pair as example
@@ -37,18 +38,6 @@ TOML_PIECES = (
     *("[" * 5000, "{a=" * 2000, "9" * 5000, "0x" + "f" * 400, "1e999", "nan", "-inf"),
     *("1979-05-27", "true", "a.b.c.d", "focal = 1", "[left]", "[photo.a]", "\x00", "é"),
 )
-
-
-def mutants(text, pieces, count, seed=0):
-    """So many texts with one place changed, or with up to four."""
-    rng = random.Random(seed)
-    for _ in range(count):
-        changed = text
-        for _ in range(rng.choice((1, 1, 1, 2, 4))):
-            at = rng.randrange(len(changed) + 1)
-            end = min(len(changed), at + rng.choice((0, 0, 1, 3, 20)))
-            changed = changed[:at] + rng.choice(pieces) + changed[end:]
-        yield changed
 
 
 def message(error):

@@ -113,3 +113,23 @@ def test_photo_coordinates_are_those_of_the_camera():
     )
     with pytest.raises(TableError, match="pixel size"):
         cameras.to_pair(measured, "file", left, right, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("[camera]\nfocal" + ".a" * 10**5 + " = 1", "line 2: found a line with 100000 points"),
+        ("# " + "a" * 10**6, "found more than 1 million bytes"),
+        ("[camera]\nfocal = 0x" + "f" * 10**5, "found a whole number of thousands of digits"),
+        ("[camera]\nfocal = " + "9" * 10**4, "found a whole number of thousands of digits"),
+        ("camera = " + "[" * 10**4, "too deep to be read"),
+        ("[camera]\nfocal = 1\nfocal = 2", "no valid TOML (Cannot overwrite a value"),
+        ("[camera]\nfocal = 1\0", "line 2: found no valid TOML"),
+    ],
+)  # fmt: skip
+def test_absurd_camera_files_are_one_sentence(content, told, tmp_path):
+    path = tmp_path / "cameras.toml"
+    path.write_text(content)
+    with pytest.raises(TableError) as error:
+        cameras.read(path)
+    assert told in str(error.value) and len(str(error.value)) < 1000
