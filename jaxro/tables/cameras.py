@@ -73,9 +73,10 @@ class Cameras:
                 "LEFT-RIGHT, the names of two photos, or the columns left and right "
                 "with these names"
             )
+        left = right = ""
         if len(known) == 1:
             left, right = name[: known[0]], name[known[0] + 1 :]
-        if len(known) != 1 or left == right:
+        if left == right:  # also where there is not one way to split
             found = repr(name)
             if len(known) > 1:
                 found += f", which can be split in {len(known)} ways"
