@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaxro import block
 from jaxro.block.network import Start
-from jaxro.block.orient_block import start_from
+from jaxro.block.adjust_chained import start_from
 
 from .calibration import CENTRE, FOCAL, SIGMA, demand, measured_in, network, seconds
 from .common import Size, ratio

@@ -32,6 +32,7 @@ from .covariance import (
     joint_covariance as joint_covariance,
     relative_covariance as relative_covariance,
 )
+from .given import Given as Given, Wrong as Wrong
 from .inner import Inner as Inner
 from .measured_block import (
     Ground as Ground,

@@ -3,54 +3,45 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment import RESULTS
 from ..adjustment.sparse import (
-    DatumOf,
     Minimum,
-    Problem,
     SparseAdjustment,
     minimise,
-    prepare,
     read,
-    trimmed,
     with_room,
 )
 from ..calibration.camera import Station
 from ..xla.programs import compiled
-from .bars import Bars, NoBar, bar_terms
-from .datum import free_datum
+from .bars import Bars, no_bars
 from .inner import Inner, InnerParameters, cameras_of, in_photo_units
-from .measured_block import Ground, MeasuredBlock, nothing_known
+from .measured_block import Ground, MeasuredBlock
 from .network import (
     Frame,
     KnownCoordinates,
     Numbered,
     Start,
     angles_and_centre,
-    complete,
-    frame_of,
-    in_order,
-    known_of,
-    number_points,
     places_of,
     ray_condition,
     spread_known,
-    terms_of,
 )
+from .prepared import Prepared, prepare_block, start_of
 
 
 @dataclass(frozen=True)
 class BlockAdjustment:
     """An adjusted block. Coordinates are those of the ground, residuals have the unit
     of the photo coordinates; standard deviations are a posteriori. NaN stands for what
-    is not there: points that nothing determines, coordinates that are not known."""
+    is not there: points that nothing determines, coordinates that are not known.
+    `bar_rows`: the bars that take part."""
 
     block: MeasuredBlock
     ground: Ground | None
@@ -60,6 +51,7 @@ class BlockAdjustment:
     inner: Inner | None
     bars: Bars | None
     adjustment: SparseAdjustment
+    bar_rows: Int[np.ndarray, " used"]
 
     @property
     def result(self) -> RESULTS:
@@ -164,7 +156,7 @@ class BlockAdjustment:
         """Stations and points, to begin another adjustment with."""
         points = np.asarray(self.adjustment.parameters["point"])
         inner = self.adjustment.parameters.get("camera")
-        return _start(self.frame, self.numbered, self.stations, points, inner)
+        return start_of(self.frame, self.numbered, self.stations, points, inner)
 
     # ---------------------------------------------------------------------------------
     # cameras
@@ -200,16 +192,39 @@ class BlockAdjustment:
         block, photo = self.block, self.block.photo
         points = self.frame.inside(np.nan_to_num(self.coordinates))[block.point]
         stations = jax.tree.map(lambda a: np.asarray(a)[photo], self.stations)
-        own = ()
-        if self.inner is not None:
-            camera = cameras_of(block.focal).of_photo[photo]
-            own = (np.asarray(self.adjustment.parameters["camera"])[camera],)
-        condition = ray_condition(self.inner)
-        data = with_room((stations, *own, points, places_of(block)))
-        found = _misfits(*data, condition=condition)
-        off = np.asarray(found)[: len(photo)] * block.focal[photo, None]
+        found = self._misfits_at(stations, points)
+        off = found * block.focal[photo, None]
         there = self.numbered.number[block.point] >= 0
         return np.where(there[:, None], off * np.array([-1.0, 1.0]), np.nan)
+
+    @property
+    def ideal_places(self) -> Float[np.ndarray, "ray 2"]:
+        """The places of all rays as a camera without any distortion would show them, in
+        units of its focal length, y downwards."""
+        places = places_of(self.block)
+        if self.inner is None:
+            return places
+        rays = len(places)
+        here = Station(np.tile([1.0, 0.0, 0.0, 0.0], (rays, 1)), np.zeros((rays, 3)))
+        ahead = np.concatenate([places, np.ones((rays, 1))], axis=1)
+        scale = 1.0
+        if self.inner.focal:
+            camera = cameras_of(self.block.focal).of_photo[self.block.photo]
+            own = np.asarray(self.adjustment.parameters["camera"])
+            scale = 1.0 + own[camera, :1]
+        return places + self._misfits_at(here, ahead) / scale
+
+    def _misfits_at(
+        self, stations: Station, points: Float[np.ndarray, "ray 3"]
+    ) -> Float[np.ndarray, "ray 2"]:
+        """The misfits of all rays from these stations to these points."""
+        block, own = self.block, ()
+        if self.inner is not None:
+            camera = cameras_of(block.focal).of_photo[block.photo]
+            own = (np.asarray(self.adjustment.parameters["camera"])[camera],)
+        data = with_room((stations, *own, points, places_of(block)))
+        found = _misfits(*data, condition=ray_condition(self.inner))
+        return np.asarray(found)[: len(block.photo)]
 
     @property
     def redundancy(self) -> Float[np.ndarray, "ray 2"]:
@@ -230,17 +245,26 @@ class BlockAdjustment:
 
     @property
     def bar_residuals(self) -> Float[np.ndarray, " bar"]:
-        """What would have to be added to the lengths of the `bars`."""
-        if self.bars is None:
-            return np.zeros(0)
-        return np.asarray(self.adjustment.residuals[-1])[:, 0] * self.bars.sigma
+        """What would have to be added to the lengths of the `bars`, NaN for those that
+        take no part."""
+        return self._of_bars(self.adjustment.residuals) * self.lengths.sigma
 
     @property
     def bar_redundancy(self) -> Float[np.ndarray, " bar"]:
         """The redundancy numbers of the lengths."""
-        if self.bars is None:
-            return np.zeros(0)
-        return np.asarray(self.adjustment.redundancy[-1])[:, 0]
+        return self._of_bars(self.adjustment.redundancy)
+
+    @property
+    def lengths(self) -> Bars:
+        """The bars, if there are none."""
+        return no_bars() if self.bars is None else self.bars
+
+    def _of_bars(self, values: list[np.ndarray]) -> np.ndarray:
+        """Those of the last term, one for each bar that was given."""
+        out = np.full(len(self.lengths.one), np.nan)
+        if len(self.bar_rows):
+            out[self.bar_rows] = np.asarray(values[-1])[:, 0]
+        return out
 
     def _of_known(self, values: list[np.ndarray]) -> list[np.ndarray]:
         """Those of the terms of known coordinates, which come after that of the
@@ -257,47 +281,6 @@ class BlockAdjustment:
         return spread_known(self.known, values, number)
 
 
-class Prepared(NamedTuple):
-    """What is to be adjusted: the problem of the engine, and where its numbers come
-    from."""
-
-    block: MeasuredBlock
-    ground: Ground | None
-    frame: Frame
-    numbered: Numbered
-    known: tuple[KnownCoordinates, ...]
-    inner: Inner | None
-    bars: Bars | None
-    problem: Problem
-    datum: DatumOf | None
-
-    def start_at(self, found: Minimum) -> Start:
-        """The stations and points of a minimum, to begin another adjustment with."""
-        families = trimmed(found.problem.data.families, found.problem.members)
-        return _start(
-            self.frame,
-            self.numbered,
-            families["photo"],
-            families["point"],
-            families.get("camera"),
-        )
-
-
-def _start(
-    units: Frame,
-    numbered: Numbered,
-    station: Station,
-    points: np.ndarray,
-    inner: np.ndarray | None,
-) -> Start:
-    return Start(
-        quaternions=np.asarray(station.quaternion),
-        centres=units.outside(station.centre),
-        points=numbered.spread(units.outside(points)),
-        inner=None if inner is None else np.asarray(inner),
-    )
-
-
 def adjust_block(
     block: MeasuredBlock,
     start: Start,
@@ -309,94 +292,14 @@ def adjust_block(
     """Adjust a block from approximate stations and points.
 
     `inner`: the inner parameters of the cameras that are unknown, too; `left_out`: rays
-    that take no part, but keep their numbers; `bars`: known distances. Without known
-    coordinates the network is free: its datum is that of the approximate photos (inner
-    constraints on their places and turns). Points on one photo, of which nothing else
-    is known, are left out. Failures are values of `adjustment.result`.
+    that take no part, but keep their numbers; `bars`: known distances (a length that is
+    NaN takes no part). Without known coordinates the network is free: its datum is that
+    of the approximate photos (inner constraints on their places and turns). Points on
+    one photo, of which nothing else is known, are left out. Failures are values of
+    `adjustment.result`.
     """
     prepared = prepare_block(block, start, ground, inner, left_out, bars)
     return conclude(prepared, minimise(prepared.problem, datum=prepared.datum))
-
-
-def prepare_block(
-    block: MeasuredBlock,
-    start: Start,
-    ground: Ground | None = None,
-    inner: Inner | None = None,
-    left_out: Bool[np.ndarray, " ray"] | None = None,
-    bars: Bars | None = None,
-) -> Prepared:
-    """The problem of a block at its approximate values, some rays left out."""
-    units = frame_of(start)
-    known = known_of(block, nothing_known() if ground is None else ground)
-    use = np.ones(len(block.photo), bool) if left_out is None else ~left_out
-    # a known point on one photo begins where it is known to be
-    points, of_points = start.points.copy(), known.take(~known.station)
-    at = of_points.number, of_points.axis
-    points[at] = np.where(np.isnan(points[at]), of_points.value, points[at])
-    points = complete(block, start, points)
-    there = np.all(np.isfinite(points), axis=1)
-    number = known.of_points(len(block.points))
-    numbered = number_points(block, number, use & there[block.point])
-    parts = in_order(known, numbered)
-    inside = units.inside(start.centres)
-    stations = Station(*jax.device_put((start.quaternions, inside)))
-    points = units.inside(points[numbered.number >= 0])
-    families = {"photo": stations, "point": points}
-    if inner is not None:
-        cameras = cameras_of(block.focal).number
-        zero = np.zeros((cameras, len(inner.free)))
-        families["camera"] = zero if start.inner is None else start.inner
-    terms = terms_of(block, numbered, parts, units, inner)
-    if bars is not None:
-        bars, between = _bars_in(bars, block, numbered)
-        families["end"] = points[between[1]]
-        spread = float(np.median(block.sigma / block.focal[block.photo]))
-        lengths = bars.length / units.length, bars.sigma / units.length
-        terms = *terms, *bar_terms(between, *lengths, spread)
-    problem = prepare(terms, families, eliminate="point", linked="photo")
-    datum = None
-    if not parts:
-        distance = _distance(block, numbered, inside, points)
-        datum = free_datum(stations, distance, has_scale=bars is not None)
-    return Prepared(
-        block=block,
-        ground=ground,
-        frame=units,
-        numbered=numbered,
-        known=parts,
-        inner=inner,
-        bars=bars,
-        problem=problem,
-        datum=datum,
-    )
-
-
-def _distance(
-    block: MeasuredBlock,
-    numbered: Numbered,
-    centres: Float[np.ndarray, "photo 3"],
-    points: Float[np.ndarray, "some 3"],
-) -> float:
-    """The median distance from photos to the points that they show."""
-    used = numbered.rays
-    shown = points[numbered.number[block.point[used]]]
-    apart = shown - centres[block.photo[used]]
-    return float(np.median(np.linalg.norm(apart, axis=1)))
-
-
-def _bars_in(
-    bars: Bars, block: MeasuredBlock, numbered: Numbered
-) -> tuple[Bars, tuple[np.ndarray, np.ndarray]]:
-    """The bars between points of the adjustment, and the numbers of these there. Raises
-    `NoBar` where there are none."""
-    one, other = bars.numbers_in(block)
-    of = lambda point: np.where(point < 0, -1, numbered.number[np.maximum(point, 0)])
-    one, other = of(one), of(other)
-    there = (one >= 0) & (other >= 0)
-    if not np.any(there):
-        raise NoBar("adjust_block: no bar has both of its points in the block")
-    return bars.take(there), (one[there], other[there])
 
 
 def conclude(prepared: Prepared, found: Minimum) -> BlockAdjustment:
@@ -410,6 +313,7 @@ def conclude(prepared: Prepared, found: Minimum) -> BlockAdjustment:
         inner=prepared.inner,
         bars=prepared.bars,
         adjustment=read(found, prepared.datum),
+        bar_rows=prepared.bar_rows,
     )
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..adjustment import Term
 from ..adjustment.guarded import root
@@ -21,32 +21,70 @@ TIED = 1e-4
 """Standard deviation of the tie, as a part of that of a point: the square of it is lost
 of the accuracy of the solution, 1e-8."""
 
+LEAST = 1e-30
+"""What stands for a length of zero where it divides."""
+
 
 class NoBar(ValueError):
     """No bar has both of its points in a block."""
 
 
 class Bars(NamedTuple):
-    """Known distances between two points each, with standard deviations."""
+    """Known distances between two points each, with standard deviations. A length that
+    is NaN takes no part in an adjustment."""
 
     one: tuple[str, ...]
     other: tuple[str, ...]
     length: Float[np.ndarray, " bar"]
     sigma: Float[np.ndarray, " bar"]
 
-    def take(self, some: np.ndarray) -> "Bars":
-        """Some of them."""
-        numbers = np.arange(len(self.one))[some]
-        names = lambda column: tuple(column[k] for k in numbers)
-        return Bars(
-            names(self.one), names(self.other), self.length[some], self.sigma[some]
-        )
+    def without(self, rows: Bool[np.ndarray, " bar"]) -> "Bars":
+        """The same without the lengths of some bars, which keep their numbers."""
+        return self._replace(length=np.where(rows, np.nan, self.length))
 
     def numbers_in(self, block: MeasuredBlock) -> tuple[np.ndarray, np.ndarray]:
         """The numbers of both points in a block, -1 where it has not got them."""
         number = {name: k for k, name in enumerate(block.points)}
         of = lambda names: np.array([number.get(name, -1) for name in names], int)
         return of(self.one), of(self.other)
+
+
+def differences(
+    given: Bars,
+    block: MeasuredBlock,
+    coordinates: Float[np.ndarray, "point 3"],
+    covariances: Float[np.ndarray, "point 3 3"],
+) -> tuple[Float[np.ndarray, " bar"], Float[np.ndarray, " bar"]]:
+    """Lengths between adjusted points minus given ones, whether they took part or not,
+    and the standard deviations of the former, both ends as if they were independent; NaN
+    where an end has no coordinates."""
+    one, other = given.numbers_in(block)
+    there = (one >= 0) & (other >= 0)
+    apart = coordinates[one] - coordinates[other]
+    length = np.linalg.norm(apart, axis=1)
+    along = apart / np.maximum(length, LEAST)[:, None]
+    both = covariances[one] + covariances[other]
+    variance = np.einsum("bi,bij,bj->b", along, both, along)
+    spread = np.sqrt(np.maximum(variance, 0.0))
+    masked = lambda values: np.where(there, values, np.nan)
+    return masked(length - given.length), masked(spread)
+
+
+def scale_of(
+    given: Bars, block: MeasuredBlock, coordinates: Float[np.ndarray, "point 3"]
+) -> float:
+    """What a network is to be multiplied by to have the lengths of its bars: the median
+    of their ratios; 1 where no bar has both ends."""
+    one, other = given.numbers_in(block)
+    apart = np.linalg.norm(coordinates[one] - coordinates[other], axis=1)
+    ratios = given.length / np.maximum(apart, LEAST)
+    there = (one >= 0) & (other >= 0) & np.isfinite(ratios)
+    return float(np.median(ratios[there])) if np.any(there) else 1.0
+
+
+def no_bars() -> Bars:
+    """The bars of a block that has none."""
+    return bars((), (), np.zeros(0), 1.0)
 
 
 def bars(

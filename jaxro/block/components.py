@@ -12,13 +12,11 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 
-from .adjust import BlockAdjustment, adjust_block
-from .bars import Bars
-from .inner import Inner
-from .measured_block import Ground, MeasuredBlock
+from .adjust import BlockAdjustment
+from .given import Given, Wrong, nothing_wrong
 from .network import Start
+from .wrong import adjust_rest
 
 ROUNDS = 30
 """Adjustments at most."""
@@ -51,7 +49,7 @@ def components_of(adjusted: BlockAdjustment) -> dict[str, Component]:
     adjustment."""
     kinds = ["stations" if part.station[0] else "control" for part in adjusted.known]
     found = adjusted.adjustment
-    names = ["places", *kinds, *(() if adjusted.bars is None else ("ties", "bars"))]
+    names = ["places", *kinds, *(("ties", "bars") if len(adjusted.bar_rows) else ())]
     groups = zip(names, found.residuals, found.redundancy, strict=True)
     return {name: _component(v, r) for name, v, r in groups if name != "ties"}
 
@@ -65,19 +63,15 @@ def _component(white: np.ndarray, redundancy: np.ndarray) -> Component:
 
 
 def adjust_with_components(
-    block: MeasuredBlock,
-    start: Start,
-    ground: Ground | None = None,
-    inner: Inner | None = None,
-    left_out: Bool[np.ndarray, " ray"] | None = None,
-    bars: Bars | None = None,
+    given: Given, start: Start, wrong: Wrong | None = None
 ) -> tuple[BlockAdjustment, dict[str, Component]]:
     """The adjustment with the standard deviations of each group as its residuals tell
-    them, and the factors that lead there from what was stated. Wrong places (`left_out`)
-    and wrong known coordinates, which are NaN, are to be found before."""
+    them, and the factors that lead there from what was stated. What is `wrong` is to be
+    found before."""
+    wrong = nothing_wrong(given) if wrong is None else wrong
     factors: dict[str, float] = dict.fromkeys(GROUPS, 1.0)
     silent: set[str] = set()
-    adjusted = adjust_block(block, start, ground, inner, left_out, bars)
+    adjusted = adjust_rest(given, start, wrong)
     found = components_of(adjusted)
     for _ in range(ROUNDS):
         # a group without redundancy would shrink to nothing: it stays as stated
@@ -88,9 +82,7 @@ def adjust_with_components(
         silent |= lost
         factors |= {name: factors[name] * one.factor for name, one in told.items()}
         factors |= dict.fromkeys(lost, 1.0)
-        places, known, lengths = multiply(block, ground, bars, factors)
-        begin = adjusted.as_start
-        adjusted = adjust_block(places, begin, known, inner, left_out, lengths)
+        adjusted = adjust_rest(multiply(given, factors), adjusted.as_start, wrong)
         found = components_of(adjusted)
     of = lambda name, one: (
         Component(1.0, np.inf, one.redundancy)
@@ -100,17 +92,13 @@ def adjust_with_components(
     return adjusted, {name: of(name, one) for name, one in found.items()}
 
 
-def multiply(
-    block: MeasuredBlock,
-    ground: Ground | None,
-    bars: Bars | None,
-    factors: Mapping[str, float],
-) -> tuple[MeasuredBlock, Ground | None, Bars | None]:
+def multiply(given: Given, factors: Mapping[str, float]) -> Given:
     """Everything with the standard deviations of each group multiplied."""
+    block, ground, inner, bars = given
     block = block._replace(sigma=block.sigma * factors["places"])
     if bars is not None:
         bars = bars._replace(sigma=bars.sigma * factors["bars"])
     if ground is not None:
         of_rows = np.where(ground.station, factors["stations"], factors["control"])
         ground = ground._replace(sigma=ground.sigma * of_rows[:, None])
-    return block, ground, bars
+    return Given(block, ground, inner, bars)

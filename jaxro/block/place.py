@@ -69,7 +69,7 @@ def place(
     if len(whole) < 3:
         return _by_all_coordinates(model, at)
     triples = _triples(whole, seed)
-    rotation, scale, shift = _similarities(model[triples], at[triples])
+    rotation, scale, shift = similarities(model[triples], at[triples])
     moved = scale[:, None, None] * np.einsum("tij,kj->tki", rotation, model)
     apart = moved + shift[:, None] - at[None]
     known = np.any(np.isfinite(apart), axis=2)
@@ -88,7 +88,7 @@ def place(
     if len(whole) > 4:
         wrong[whole] = _stands_out(model[whole], apart[best, whole])
     used = whole[~wrong[whole]]
-    (rotation,), (scale,), (shift,) = _similarities(model[used][None], at[used][None])
+    (rotation,), (scale,), (shift,) = similarities(model[used][None], at[used][None])
     fitted = shift + scale * model @ rotation.T - at
     left = np.sqrt(np.nansum(fitted**2, axis=1))
     return Placed(
@@ -165,7 +165,7 @@ def _triples(whole: np.ndarray, seed: int) -> np.ndarray:
     return whole[np.argpartition(keys, 3, axis=1)[:, :3]]
 
 
-def _similarities(
+def similarities(
     model: Float[np.ndarray, "t k 3"], at: Float[np.ndarray, "t k 3"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotation, scale and shift of each set of points by least squares (Umeyama 1991);

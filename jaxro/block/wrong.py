@@ -1,4 +1,4 @@
-"""Wrong places and wrong known coordinates of a block.
+"""Wrong places, wrong known coordinates and wrong bars of a block.
 
 Where a plain adjustment shows that little can be wrong, its normalised residuals w
 (Baarda 1968) are tested in a few rounds, the largest one of each neighbourhood at a
@@ -20,12 +20,14 @@ from jaxtyping import Bool, Float
 
 from ..adjustment import RESULTS, critical_values
 from ..adjustment.sparse import Minimum, Problem, minimise, residuals_of
-from .adjust import BlockAdjustment, Prepared, adjust_block, conclude, prepare_block
-from .bars import Bars
-from .inner import Inner
-from .measured_block import Ground, MeasuredBlock
+from .adjust import BlockAdjustment, adjust_block, conclude
+from .bars import Bars, differences, scale_of
+from .given import Given, Wrong, nothing_wrong
+from .measured_block import Ground
 from .network import Start, spread_known
 from .place import TooLittleControl
+from .prepared import Prepared, prepare_block
+from .wrong_points import decide
 
 SURE = 3.0
 """The last scale c of the redescending weights, in standard deviations."""
@@ -55,82 +57,102 @@ UNCHECKED = 0.02
 """Redundancy below which nothing checks a coordinate: it is told, not tested."""
 
 
-class Wrong(NamedTuple):
-    """What was left out: rays, and known coordinates; `settled`: whether nothing more
-    is beyond the limit of the tests."""
-
-    rays: Bool[np.ndarray, " ray"]
-    control: Bool[np.ndarray, "known 3"]
-    settled: bool = False
-
-    def __or__(self, other: "Wrong") -> "Wrong":
-        return Wrong(self.rays | other.rays, self.control | other.control)
-
-
 class Tested(NamedTuple):
     """Normalised residuals of what takes part (NaN where nothing checks it), and the
     limit that the largest of all exceeds by chance with the probability `level`."""
 
     rays: Float[np.ndarray, "ray 2"]
     control: Float[np.ndarray, "known 3"]
+    bars: Float[np.ndarray, " bar"]
     limit: float
 
 
 def adjust_without_wrong(
-    block: MeasuredBlock,
-    start: Start,
-    ground: Ground | None = None,
-    inner: Inner | None = None,
-    bars: Bars | None = None,
-    level: float = 0.05,
+    given: Given, start: Start, level: float = 0.05
 ) -> tuple[BlockAdjustment, Wrong]:
-    """Adjust a block without its wrong rays and known coordinates. `inner`: the inner
-    parameters that are unknown; `bars`: known distances. Where the rays fit no block
-    the adjustment says that it diverged. Raises `TooLittleControl` where hardly a known
-    coordinate fits the photos."""
-    nothing = Wrong(
-        np.zeros(len(block.photo), bool), np.zeros((_control_points(ground), 3), bool)
-    )
-    plain = adjust_rest(block, start, ground, nothing, inner, bars)
+    """Adjust a block without its wrong rays, known coordinates and bars. Where the rays
+    fit no block the adjustment says that it diverged. Raises `TooLittleControl` where
+    hardly a known coordinate fits the photos.
+
+    Bars are judged by the block without them: a length that is far more certain than a
+    ray would rather have a good ray left out than be wrong itself.
+    """
+    alone = given._replace(bars=None)
+    adjusted, wrong = _without_bars(alone, start, level)
+    bars = given.bars
+    if bars is None or adjusted.result != RESULTS.successful or not wrong.settled:
+        none = nothing_wrong(given).bars
+        return adjusted, wrong._replace(bars=none)
+    is_free = not adjusted.known
+    scale = scale_of(bars, given.block, adjusted.coordinates) if is_free else 1.0
+    wrong = wrong._replace(bars=_wrong_bars(bars, adjusted, scale, level))
+    begin = adjusted.as_start
+    begin = begin._replace(centres=begin.centres * scale, points=begin.points * scale)
+    return _test(given, adjust_rest(given, begin, wrong), wrong, level)
+
+
+def _wrong_bars(
+    bars: Bars, adjusted: BlockAdjustment, scale: float, level: float
+) -> Bool[np.ndarray, " bar"]:
+    """The bars that contradict a block, which is to be multiplied by a scale."""
+    places = adjusted.coordinates * scale, adjusted.point_covariances * scale**2
+    off, spread = differences(bars, adjusted.block, *places)
+    w = np.abs(off) / np.hypot(spread, adjusted.sigma0 * bars.sigma)
+    each = critical_values.sidak(level, max(int(np.sum(np.isfinite(w))), 1))
+    return np.nan_to_num(w) > critical_values.normal(each)
+
+
+def _without_bars(
+    given: Given, start: Start, level: float
+) -> tuple[BlockAdjustment, Wrong]:
+    """The adjustment without wrong rays and known coordinates."""
+    nothing = nothing_wrong(given)
+    plain = adjust_rest(given, start, nothing)
     if plain.sigma0 < NEARLY_RIGHT:
-        adjusted, wrong = _test(plain, ground, nothing, level, FEW)
+        adjusted, wrong = _test(given, plain, nothing, level, FEW)
         if wrong.settled:
             return adjusted, wrong
-    prepared = prepare_block(block, start, ground, inner, bars=bars)
+    prepared = _prepare(given, start)
     found = settle(prepared)
     wrong = _far(prepared, found)
     if np.mean(wrong.rays[prepared.numbered.rays]) > MOST:
         lost = found._replace(result=RESULTS.diverged)
         return conclude(prepared, lost), nothing
-    begin = prepared.start_at(found)
-    adjusted = adjust_rest(block, begin, ground, wrong, inner, bars)
-    adjusted, wrong = _test(adjusted, ground, wrong, level)
-    if ground is None or not wrong.settled:
+    adjusted = adjust_rest(given, prepared.start_at(found), wrong)
+    if adjusted.result != RESULTS.successful:
         return adjusted, wrong
-    # robust estimators leave out what little else checks: it comes back, and is tested
-    back = np.any(wrong.control, axis=1) & fits(adjusted, ground, level)
+    # robust estimators choose one ray where several explain the misfit, and leave out
+    # what little else checks
+    rays = decide(adjusted, wrong.rays, may_be_right=True)
+    wrong = wrong._replace(rays=rays)
+    adjusted = adjust_rest(given, adjusted.as_start, wrong)
+    adjusted, wrong = _test(given, adjusted, wrong, level)
+    if not wrong.settled:
+        return adjusted, wrong
+    back = np.any(wrong.control, axis=1) & fits(adjusted, given.known, level)
     if not np.any(back):
         return adjusted, wrong
     wrong = wrong._replace(control=wrong.control & ~back[:, None])
-    adjusted = adjust_rest(block, adjusted.as_start, ground, wrong, inner, bars)
-    return _test(adjusted, ground, wrong, level)
+    adjusted = adjust_rest(given, adjusted.as_start, wrong)
+    return _test(given, adjusted, wrong, level)
 
 
 def _test(
+    given: Given,
     adjusted: BlockAdjustment,
-    ground: Ground | None,
     wrong: Wrong,
     level: float,
     rounds: int = TESTS,
 ) -> tuple[BlockAdjustment, Wrong]:
     """The adjustment without what the tests reject, in rounds."""
     for _ in range(rounds):
+        if adjusted.result != RESULTS.successful:
+            break
         more = _worst(adjusted, normalise_residuals(adjusted, level))
-        if not (np.any(more.rays) or np.any(more.control)):
+        if not more:
             return adjusted, wrong._replace(settled=True)
         wrong = wrong | more
-        begin, rest = adjusted.as_start, (adjusted.inner, adjusted.bars)
-        adjusted = adjust_rest(adjusted.block, begin, ground, wrong, *rest)
+        adjusted = adjust_rest(given, adjusted.as_start, wrong)
     return adjusted, wrong._replace(settled=False)
 
 
@@ -146,20 +168,32 @@ def fits(
     return known & np.all((z < critical_values.normal(each)) | np.isnan(z), axis=1)
 
 
-def adjust_rest(
-    block: MeasuredBlock,
-    start: Start,
-    ground: Ground | None,
-    wrong: Wrong,
-    inner: Inner | None = None,
-    bars: Bars | None = None,
-) -> BlockAdjustment:
-    """The adjustment without what is wrong; rays and points keep their numbers."""
-    if ground is not None:
-        at = np.where(wrong.control, np.nan, ground.coordinates)
-        _check_control(ground, at)
-        ground = ground._replace(coordinates=at)
-    return adjust_block(block, start, ground, inner, wrong.rays, bars)
+def adjust_rest(given: Given, start: Start, wrong: Wrong) -> BlockAdjustment:
+    """The adjustment without what is wrong; rays, points, known points and bars keep
+    their numbers."""
+    return adjust_block(
+        given.block,
+        start,
+        _known_rest(given, wrong),
+        given.inner,
+        wrong.rays,
+        None if given.bars is None else given.bars.without(wrong.bars),
+    )
+
+
+def _prepare(given: Given, start: Start) -> Prepared:
+    """The problem of everything that is given."""
+    block, ground, inner, bars = given
+    return prepare_block(block, start, ground, inner, bars=bars)
+
+
+def _known_rest(given: Given, wrong: Wrong) -> Ground | None:
+    """What is known of the ground without what is wrong of it."""
+    if given.ground is None:
+        return None
+    at = np.where(wrong.control, np.nan, given.ground.coordinates)
+    _check_control(given.ground, at)
+    return given.ground._replace(coordinates=at)
 
 
 def _check_control(ground: Ground, left: Float[np.ndarray, "known 3"]) -> None:
@@ -175,23 +209,27 @@ def _check_control(ground: Ground, left: Float[np.ndarray, "known 3"]) -> None:
 
 
 def normalise_residuals(adjusted: BlockAdjustment, level: float = 0.05) -> Tested:
-    """w = v / (sigma0 sigma √r) of all coordinates that something checks."""
+    """w = v / (sigma0 sigma √r) of all coordinates and lengths that something checks."""
     normalise = lambda v, sigma, r: np.where(
         r > UNCHECKED, v / (sigma * np.sqrt(np.maximum(r, UNCHECKED))), np.nan
     )
     unit = adjusted.sigma0 if adjusted.degrees_of_freedom > 0 else 1.0
     sigma = adjusted.block.sigma[:, None] * unit
     rays = normalise(adjusted.residuals, sigma, adjusted.redundancy)
-    control = np.zeros((0, 3))
+    control, bars = np.zeros((0, 3)), np.zeros(0)
     if adjusted.ground is not None:
         control = normalise(
             adjusted.control_residuals,
             adjusted.ground.sigma * unit,
             adjusted.control_redundancy,
         )
-    number = np.sum(np.isfinite(rays)) + np.sum(np.isfinite(control))
-    each = critical_values.sidak(level, max(int(number), 1))
-    return Tested(rays, control, float(critical_values.normal(each)))
+    if adjusted.bars is not None:
+        bars = normalise(
+            adjusted.bar_residuals, adjusted.bars.sigma * unit, adjusted.bar_redundancy
+        )
+    number = sum(int(np.sum(np.isfinite(w))) for w in (rays, control, bars))
+    each = critical_values.sidak(level, max(number, 1))
+    return Tested(rays, control, bars, float(critical_values.normal(each)))
 
 
 # -------------------------------------------------------------------------------------
@@ -241,34 +279,43 @@ def _scale(sizes: Float[np.ndarray, " group"], before: float) -> float:
 
 def _far(prepared: Prepared, found: Minimum) -> Wrong:
     """What is beyond `CLEAR`."""
+    wrong = nothing_wrong(Given(prepared.block, prepared.ground))
     far, *of_known = [sizes > CLEAR for sizes in _sizes(found.problem)]
-    rays = np.zeros(len(prepared.block.photo), bool)
-    rays[prepared.numbered.rays] = far
-    known, number = prepared.known, _control_points(prepared.ground)
-    return Wrong(rays, spread_known(known, of_known[: len(known)], number, False))
+    wrong.rays[prepared.numbered.rays] = far
+    number = len(wrong.control)
+    control = spread_known(prepared.known, of_known, number, False)
+    return wrong._replace(control=control)
 
 
 def _worst(adjusted: BlockAdjustment, tested: Tested) -> Wrong:
-    """The largest w beyond the limit: one ray of each point and each photo, and one
-    known point with all its coordinates, where this is larger than its rays are."""
+    """The largest w beyond the limit: a bar; or one known point with all its coordinates,
+    where this is larger than those of its rays are; or one ray of each point and each
+    photo, with all others that explain the misfit as well."""
     block = adjusted.block
+    nothing = nothing_wrong(Given(block, adjusted.ground, bars=adjusted.bars))
     of_ray = np.max(np.nan_to_num(np.abs(tested.rays)), axis=1)
     of_point = np.zeros(len(block.points))
     np.maximum.at(of_point, block.point, of_ray)
-    rays = np.zeros(len(block.photo), bool)
-    control = np.zeros(tested.control.shape, bool)
-    if adjusted.ground is not None and len(tested.control) > 0:
-        of_known = np.max(np.nan_to_num(np.abs(tested.control)), axis=1)
+    of_bar = np.nan_to_num(np.abs(tested.bars))
+    of_known = np.max(np.nan_to_num(np.abs(tested.control)), axis=1, initial=0.0)
+    # the error of a bar or of a known point is in the residuals of all rays around it
+    if np.max(of_bar, initial=0.0) > max(tested.limit, np.max(of_known, initial=0.0)):
+        bar = int(np.argmax(of_bar))
+        one, other = (ends[bar] for ends in adjusted.lengths.numbers_in(block))
+        if of_bar[bar] > max(of_point[one], of_point[other]):
+            nothing.bars[bar] = True
+            return nothing
+    if adjusted.ground is not None and len(of_known) > 0:
         worst = int(np.argmax(of_known))
         number = adjusted.ground.numbers_in(block)[worst]
         station = adjusted.ground.station[worst]
         beside = 0.0 if station or number < 0 else of_point[number]
         if of_known[worst] > max(tested.limit, beside):
-            control[worst] = True
-            # its error is in the residuals of all rays around it
-            return Wrong(rays, control)
+            nothing.control[worst] = True
+            return nothing
     free_points = np.ones(len(block.points), bool)
     free_photos = np.ones(len(block.photos), bool)
+    rays = nothing.rays
     for ray in np.argsort(-of_ray):
         if of_ray[ray] <= tested.limit:
             break
@@ -276,8 +323,4 @@ def _worst(adjusted: BlockAdjustment, tested: Tested) -> Wrong:
         if free_points[point] and free_photos[photo]:
             rays[ray] = True
             free_points[point] = free_photos[photo] = False
-    return Wrong(rays, control)
-
-
-def _control_points(ground: Ground | None) -> int:
-    return 0 if ground is None else len(ground.points)
+    return nothing._replace(rays=decide(adjusted, rays))

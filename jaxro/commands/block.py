@@ -121,6 +121,7 @@ def calculate(task: Task, options: Options) -> Done:
                 bars=task.bars,
                 level=options.level,
                 components=options.components,
+                sigma_known=task.sigma_known,
             )
     except Unjoined as error:
         raise TableError(
@@ -150,5 +151,6 @@ def calculate(task: Task, options: Options) -> Done:
         pairs=task.names,
         oriented=oriented,
         ground=task.ground,
+        bars=task.bars,
         approximate=task.approximate,
     )

@@ -58,12 +58,18 @@ def _cameras(options: request.Options, table: Table) -> Cameras:
     return cameras
 
 
+def is_sigma_given(options: request.Options, table: Table) -> bool:
+    """Whether the standard deviation of the places was given, and not told by their
+    residuals."""
+    return table.has_sigma or options.sigma not in (None, deviation.AUTO)
+
+
 def measure(
     options: request.Options, table: Table, cameras: Cameras
 ) -> tuple[Ragged, str]:
     """The pairs in photo coordinates, and what their standard deviation is. Raises
     TableError."""
-    given = table.has_sigma or options.sigma not in (None, deviation.AUTO)
+    given = is_sigma_given(options, table)
     both = cameras.of_all(
         table.names,
         table.file,

@@ -29,7 +29,7 @@ from ..tables.ground import GroundPoints
 from ..tables.measured import Table, to_list
 from ..tables.survey_checks import Row
 from . import request
-from .block_pairs import measure, read_pairs
+from .block_pairs import is_sigma_given, measure, read_pairs
 
 RADIAL = ("k1", "k2", "k3")
 INNER = ("focal", "principal", *RADIAL, "tangential", "affinity")
@@ -77,7 +77,8 @@ class Options:
 class Task:
     """A block to be oriented, read and checked. `left`, `right`: the photos of each
     pair; `points`: the names of the rows of `pairs`; `more`: the block with further
-    rays; `sigma` in words; `approximate`: points of the ground that are no more."""
+    rays; `sigma` in words, and whether it was given (`sigma_known`); `approximate`:
+    points of the ground that are no more."""
 
     title: str
     names: list[str]
@@ -86,6 +87,7 @@ class Task:
     pairs: Ragged
     points: list[str]
     sigma: str
+    sigma_known: bool = True
     ground: Ground | None = None
     more: MeasuredBlock | None = None
     bars: Bars | None = None
@@ -120,6 +122,7 @@ def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
         pairs=pairs,
         points=list(map(str, to_list(table.points))),
         sigma=told,
+        sigma_known=is_sigma_given(own, table),
         ground=ground,
         bars=_bars(options),
         approximate=approximate,

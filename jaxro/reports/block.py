@@ -17,6 +17,12 @@ from .text import number
 POORLY = 0.1
 """Redundancy below which a control coordinate is said to be poorly checked."""
 
+CONTRADICTED = (
+    " So much is no single error, and no cause that was tried explains it: look at names, "
+    "axes, units and coordinate systems, and at the camera."
+)
+"""What is to be done about a block that what is known contradicts."""
+
 SHOWN = 10
 """Names that a sentence tells of a longer list."""
 
@@ -45,8 +51,8 @@ def contents_in_words(done: Done) -> str:
     told = kinds_in_words(done.control.known)
     ground = "free network" if done.ground is None else f"control {told}"
     checks = f"; {len(done.checks.names)} check points" if done.ground else ""
-    if done.adjusted.bars is not None:
-        checks += f"; {len(done.adjusted.bars.one)} scale bars"
+    if done.bars is not None:
+        checks += f"; {len(done.bars.one)} scale bars"
     return (
         f"{len(block.photos)} photos in {len(done.pairs)} pairs, "
         f"{np.sum(done.determined)} points on {len(block.x)} places; {ground}{checks}"
@@ -59,6 +65,11 @@ def contents_in_words(done: Done) -> str:
 
 def verdict(done: Done) -> str:
     """Whether the numbers may be used, in one sentence."""
+    if (cause := done.oriented.cause) is not None:
+        return f"[bold red]not usable as given[/bold red]: {escape(cause.sentence)}."
+    if done.contradictions:
+        told = " ".join(done.contradictions)
+        return f"[bold red]not usable[/bold red]: {escape(told)}{CONTRADICTED}"
     if done.adjusted.result != RESULTS.successful:
         return f"[bold red]not usable[/bold red]: {RESULTS[done.adjusted.result]}"
     if not done.usable:
@@ -125,8 +136,12 @@ def _components(done: Done) -> str:
 
 def _show_left_out(console: Console, done: Done) -> None:
     """What was left out as wrong."""
-    rays, control = done.left_out, _wrong_control(done)
-    if not rays and not control:
+    rays, control, bars = done.left_out, _wrong_control(done), _wrong_bars(done)
+    for sentence in bars:
+        console.print(
+            f"[yellow]Scale bar left out as wrong:[/yellow] {escape(sentence)}"
+        )
+    if not rays and not control and not bars:
         console.print("Nothing was left out as wrong.")
         return
     if control:
@@ -155,6 +170,19 @@ def _show_left_out(console: Console, done: Done) -> None:
 def _wrong_control(done: Done) -> list[str]:
     wrong = np.any(done.wrong_control & done.control.known, axis=1)
     return [done.control.names[k] for k in np.flatnonzero(wrong)]
+
+
+def _wrong_bars(done: Done) -> list[str]:
+    """The bars that were left out, each with its difference and its test."""
+    bars, wrong = done.bars, done.oriented.wrong.bars
+    if bars is None:
+        return []
+    off, sizes = done.bar_differences[0], np.abs(done.bar_tests)
+    return [
+        f"{bars.one[k]} to {bars.other[k]}, adjusted minus given "
+        f"{number(off[k], 3)} {done.unit}, |d|/sd {number(sizes[k], 1)}"
+        for k in np.flatnonzero(wrong)
+    ]
 
 
 def _accuracy(done: Done) -> str:
@@ -251,7 +279,7 @@ def show_control(console: Console, done: Done) -> None:
 
 
 def show_bars(console: Console, done: Done) -> None:
-    bars, found = done.adjusted.bars, done.adjusted
+    bars, found = done.bars, done.adjusted
     if bars is None:
         return
     title = f"Scale bars: adjusted minus given [{done.unit}], redundancy r"
@@ -263,8 +291,8 @@ def show_bars(console: Console, done: Done) -> None:
         bars.one,
         bars.other,
         bars.length,
-        found.bar_residuals,
-        found.bar_redundancy,
+        done.bar_differences[0],
+        np.nan_to_num(found.bar_redundancy),
         sizes,
         strict=True,
     )
@@ -287,7 +315,7 @@ def sentences(done: Done) -> list[str]:
     if done.strange:
         names = join_names(done.strange, SHOWN)
         said.append(f"No photo shows these points of the ground: {names}.")
-    if done.lonely:
+    if done.lonely and done.usable:
         names = join_names(done.lonely, SHOWN)
         said.append(
             f"{len(done.lonely)} points are on one photo only, or lost the places that "
@@ -335,7 +363,7 @@ def _of_fit(done: Done) -> list[str]:
 
 def _of_control(done: Done) -> list[str]:
     if done.ground is None:
-        scale = " and scale" if done.adjusted.bars is None else ""
+        scale = " and scale" if done.bars is None else ""
         return [
             f"Without known points the block has any position{scale}; standard "
             "deviations refer to its stations as a whole (inner constraints)."

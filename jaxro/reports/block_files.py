@@ -53,6 +53,8 @@ def summary(done: Done) -> dict[str, Any]:
         "file": done.title,
         "result": _result(done),
         "usable": done.usable,
+        "cause": None if done.oriented.cause is None else done.oriented.cause._asdict(),
+        "contradictions": list(done.contradictions),
         "sigma": done.sigma,
         "sigma0": adjusted.sigma0,
         "degrees_of_freedom": adjusted.degrees_of_freedom,
@@ -121,7 +123,7 @@ def _cameras(done: Done) -> Columns:
 
 def _bars(done: Done) -> Columns:
     """The scale bars; w is empty where nothing checks them."""
-    bars = done.adjusted.bars
+    bars = done.bars
     if bars is None:
         return {"from": []}
     return {
@@ -129,8 +131,8 @@ def _bars(done: Done) -> Columns:
         "to": list(bars.other),
         "length": bars.length,
         "sigma": bars.sigma,
-        "v": done.adjusted.bar_residuals,
-        "redundancy": done.adjusted.bar_redundancy,
+        "v": done.bar_differences[0],
+        "redundancy": np.nan_to_num(done.adjusted.bar_redundancy),
         "w": done.bar_tests,
     }
 

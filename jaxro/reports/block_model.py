@@ -10,10 +10,11 @@ from jaxtyping import Bool, Float, Int
 
 from ..adjustment import RESULTS, critical_values as critical
 from ..block.adjust import BlockAdjustment
+from ..block.bars import Bars, differences
 from ..block.measured_block import Ground
 from ..block.orient_block import OrientedBlock
 from ..block.reliability import BlockReliability, assess_block
-from ..block.wrong import UNCHECKED, Tested, normalise_residuals
+from ..block.wrong import Tested, normalise_residuals
 from .control import LEVEL, Compared
 
 LEAST = 1e-12
@@ -39,8 +40,9 @@ class Done:
 
     `unit` of the ground, "" for a free network; `photo_unit` of the photo coordinates;
     `pairs`: the names of the pairs; `ground`: all that is known of it, None for a free
-    network; `approximate`: how many of its points are no more than that; `sigma`: how
-    the standard deviation of the photo coordinates came about, in words.
+    network; `bars`: all that were given; `approximate`: how many of the known points are
+    no more than that; `sigma`: how the standard deviation of the photo coordinates came
+    about, in words.
     """
 
     title: str
@@ -50,6 +52,7 @@ class Done:
     pairs: list[str]
     oriented: OrientedBlock
     ground: Ground | None
+    bars: Bars | None = None
     approximate: int = 0
 
     @property
@@ -61,7 +64,13 @@ class Done:
     def usable(self) -> bool:
         """Whether the numbers may be used."""
         settled = self.oriented.wrong.settled
-        return bool(self.adjusted.result == RESULTS.successful) and settled
+        found = bool(self.adjusted.result == RESULTS.successful) and settled
+        return found and self.oriented.cause is None and not self.contradictions
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """What of that which was given does not fit as a whole."""
+        return self.oriented.contradictions
 
     @cached_property
     def tested(self) -> Tested:
@@ -166,13 +175,23 @@ class Done:
 
     @property
     def bar_tests(self) -> Float[np.ndarray, " bar"]:
-        """w of the scale bars, NaN where nothing checks them."""
-        if self.adjusted.bars is None:
+        """w of the scale bars, NaN where nothing checks them; of those that take no part
+        their differences in standard deviations."""
+        if self.bars is None:
             return np.zeros(0)
-        r = self.adjusted.bar_redundancy
-        unit = self.adjusted.sigma0 * self.adjusted.bars.sigma
-        w = self.adjusted.bar_residuals / (unit * np.sqrt(np.maximum(r, UNCHECKED)))
-        return np.where(r > UNCHECKED, w, np.nan)
+        off, spread = self.bar_differences
+        ratios = off / np.hypot(spread, self.adjusted.sigma0 * self.bars.sigma)
+        used = np.isfinite(self.adjusted.bar_residuals)
+        return np.where(used, self.tested.bars, ratios)
+
+    @cached_property
+    def bar_differences(self) -> tuple[np.ndarray, np.ndarray]:
+        """Adjusted minus given lengths of all bars, and the deviations of the former."""
+        assert self.bars is not None
+        found = self.adjusted
+        return differences(
+            self.bars, found.block, found.coordinates, found.point_covariances
+        )
 
     @property
     def limit_of_checks(self) -> float:

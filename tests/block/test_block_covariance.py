@@ -9,8 +9,8 @@ from oracles_block import dense_cofactor
 
 from jaxro import block
 from jaxro.block.adjust import adjust_block
+from jaxro.block.adjust_chained import start_from
 from jaxro.block.covariance import difference, joint_covariance, relative_covariance
-from jaxro.block.orient_block import start_from
 from jaxro.block.sensitivity import differentiate
 
 POINTS = ("c1", "t9", "t20")

@@ -8,7 +8,8 @@ from oracles_block import dense_slopes, find_rays, rotations_of, with_wrong_rays
 from jaxro import block
 from jaxro.adjustment import RESULTS
 from jaxro.block.adjust import adjust_block
-from jaxro.block.orient_block import orient_block, start_from
+from jaxro.block.adjust_chained import start_from
+from jaxro.block.orient_block import orient_block
 
 
 def adjust_freely(strips, models, seed=1):

@@ -6,7 +6,7 @@ import pytest
 
 from jaxro import block
 from jaxro.block.adjust import adjust_block
-from jaxro.block.orient_block import start_from
+from jaxro.block.adjust_chained import start_from
 from jaxro.block.plan import plan_block, plan_rays, where_control_helps
 from jaxro.block.reliability import assess_block
 

@@ -8,7 +8,7 @@ import pytest
 
 from jaxro import block
 from jaxro.block.adjust import adjust_block
-from jaxro.block.orient_block import start_from
+from jaxro.block.adjust_chained import start_from
 from jaxro.block.reliability import assess_block
 from jaxro.block.wrong import normalise_residuals
 
@@ -138,7 +138,7 @@ def plant(seed, flight, size, kind):
         at[row, axis] += error
         ground = ground._replace(coordinates=at)
         point = ground.points[row]
-    wrong = block.adjust_without_wrong(measured, start, ground)[1]
+    wrong = block.adjust_without_wrong(block.Given(measured, ground), start)[1]
     named = {measured.points[k] for k in measured.point[wrong.rays]}
     named |= {ground.points[k] for k in np.flatnonzero(np.any(wrong.control, axis=1))}
     return point in named, len(named - {point})

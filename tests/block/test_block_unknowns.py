@@ -6,8 +6,8 @@ import pytest
 
 from jaxro import block
 from jaxro.block import Flight, Inner, adjust_block
+from jaxro.block.adjust_chained import start_from
 from jaxro.block.components import adjust_with_components, components_of
-from jaxro.block.orient_block import start_from
 
 FLIGHT = Flight(strips=3, models=5, relief=200.0)
 
@@ -134,7 +134,7 @@ def test_variance_components_find_what_was_stated_wrong():
         start = start_from(mock.block, mock.photos)
         ground = mock.ground._replace(sigma=mock.ground.sigma / 4)
         measured = mock.block._replace(sigma=mock.block.sigma * 2)
-        adjusted, found = adjust_with_components(measured, start, ground)
+        adjusted, found = adjust_with_components(block.Given(measured, ground), start)
         assert adjusted.sigma0 == pytest.approx(1, abs=1e-4)
         again = components_of(adjusted)
         assert all(abs(one.factor - 1) < 1e-3 for one in again.values())

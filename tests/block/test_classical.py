@@ -7,6 +7,7 @@ import pytest
 import jaxro
 from jaxro import block
 from jaxro.block import classical
+from jaxro.block.adjust_chained import start_from
 from jaxro.block.classical import adjust_models, deviations_of, placed
 from jaxro.block.classical_comparison import (
     along_strips,
@@ -14,7 +15,6 @@ from jaxro.block.classical_comparison import (
     compare_estimators,
 )
 from jaxro.block.classical_models import measure_models
-from jaxro.block.orient_block import start_from
 
 STRIP_OF_TWO = block.Flight(models=2)
 

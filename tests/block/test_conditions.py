@@ -9,10 +9,10 @@ import pytest
 from jaxro import block
 from jaxro.adjustment import RESULTS
 from jaxro.block import conditions_of_block
+from jaxro.block.adjust_chained import start_from
 from jaxro.block.conditions import adjust_conditions
 from jaxro.block.measured_block import add_rays
 from jaxro.block.network import frame_of
-from jaxro.block.orient_block import start_from
 
 
 def start_of(mock):

@@ -10,8 +10,8 @@ import pytest
 
 from jaxro import block
 from jaxro.block.adjust import adjust_block
+from jaxro.block.adjust_chained import start_from
 from jaxro.block.covariance import joint_covariance
-from jaxro.block.orient_block import start_from
 
 gtsam = pytest.importorskip("gtsam")
 

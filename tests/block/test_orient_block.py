@@ -10,9 +10,10 @@ from jaxro import block
 from jaxro.adjustment import RESULTS
 from jaxro.batches.ragged import Ragged, orient_ragged
 from jaxro.block.adjust import adjust_block
+from jaxro.block.adjust_chained import start_from
 from jaxro.block.chain import Chained
 from jaxro.block.measured_block import MeasuredBlock
-from jaxro.block.orient_block import orient_block, start_from
+from jaxro.block.orient_block import orient_block
 from jaxro.block.wrong import normalise_residuals
 
 
@@ -171,7 +172,7 @@ def test_control_of_another_system_is_not_left_out_silently():
         block.TooLittleControl, match="known coordinates fit the photos"
     ):
         block.adjust_without_wrong(
-            mock.block, start, mock.ground._replace(coordinates=at)
+            block.Given(mock.block, mock.ground._replace(coordinates=at)), start
         )
 
 

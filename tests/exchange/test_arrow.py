@@ -11,7 +11,7 @@ import pytest
 import jaxro
 from jaxro import block
 from jaxro.batches.ragged import Ragged
-from jaxro.block.orient_block import start_from
+from jaxro.block.adjust_chained import start_from
 from jaxro.exchange import to_arrow
 from jaxro.reports import block_files, files
 from jaxro.reports.block_model import Done
@@ -147,7 +147,7 @@ def test_orientations_of_a_batch(results):
 def test_blocks_and_what_has_no_tables(results):
     mock = block.mock_block(1, block.Flight(models=3))
     start = start_from(mock.block, mock.photos)
-    found = block.adjust_without_wrong(mock.block, start, mock.ground)
+    found = block.adjust_without_wrong(block.Given(mock.block, mock.ground), start)
     oriented = block.OrientedBlock(*found, {}, None, np.ones(1, bool))
     done = Done("block", "m", "mm", "given", ["1-2"], oriented, mock.ground)
     columns = block_files.tables(done)

@@ -11,7 +11,7 @@ import pytest
 import jaxro
 from jaxro import block, exchange
 from jaxro.block.adjust import adjust_block
-from jaxro.block.orient_block import start_from
+from jaxro.block.adjust_chained import start_from
 from jaxro.exchange import tangents
 from jaxro.geometry import mock_pairs
 

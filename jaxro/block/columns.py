@@ -1,0 +1,167 @@
+"""Ways in which whole columns of known coordinates are wrong: northing in the column of
+easting, feet, degrees, heights that are all 0, the coordinates of the next row.
+
+Each is a function of numbers, and one hypothesis: where everything fits after it and
+nothing does before, it is the cause. The mirror image stands for several causes, which
+no fit tells apart.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+FOOT = 0.3048
+"""Metres in a foot."""
+
+UNITS = (
+    ("heights_in_feet", FOOT, "they are in feet"),
+    ("plan_in_feet", 1 / FOOT, "plan is in feet and heights are in metres"),
+    ("heights_in_mm", 0.001, "they are in thousandths of the unit of plan"),
+    ("plan_in_km", 1000.0, "plan is in thousandths of their unit"),
+)
+"""Heights in another unit than plan: the name of it, by what they are to be multiplied,
+and what to say."""
+
+EQUAL = 1e-6
+"""Part of the extent in plan within which heights are all equal."""
+
+EQUAL_HEIGHTS = "heights_equal"
+"""The hypothesis that heights are none."""
+
+AXIS, FLATTENING = 6_378_137.0, 1 / 298.257
+"""Half the major axis of the ellipsoid of the earth in metres, and its flattening."""
+
+DEGREES = (("longitude, latitude", (0, 1)), ("latitude, longitude", (1, 0)))
+"""The order of degrees, and the columns of longitude and latitude."""
+
+UNCERTAIN = 0.1
+"""Standard deviation of a height of which nothing is known, over the extent in plan."""
+
+FEWEST = 3
+"""Known values of which a column can be judged."""
+
+Known = Float[np.ndarray, "known 3"]
+Rows = Bool[np.ndarray, " known"]
+
+
+class Cause(NamedTuple):
+    """What is wrong with what was given: a name, and a sentence with its figure."""
+
+    name: str
+    sentence: str
+
+
+class Altered(NamedTuple):
+    """A hypothesis: what is wrong, in a sentence; the coordinates that would be right;
+    and those that would be `unknown`: they tell no more than where the ground is about.
+    """
+
+    name: str
+    sentence: str
+    coordinates: Known
+    unknown: Bool[np.ndarray, "known 3"]
+
+
+def alter(coordinates: Known, rows: Rows, who: str) -> list[Altered]:
+    """All hypotheses about the coordinates of some rows, those of the others as they
+    are. `who` they are, in the plural ("control points"), begins each sentence."""
+    at = coordinates
+    if np.sum(rows & np.all(np.isfinite(at), axis=1)) < FEWEST:
+        return []
+
+    def altered(
+        name: str, sentence: str, change: Callable[[Known], Known] | None
+    ) -> Altered:
+        changed, unknown = at.copy(), np.zeros(at.shape, bool)
+        if change is None:
+            unknown[rows, 2] = True
+        else:
+            changed[rows] = change(at[rows])
+        return Altered(name, sentence, changed, unknown)
+
+    found = [
+        altered(
+            "mirrored",
+            f"The {who} fit the mirror image of what was measured: X and Y are "
+            "exchanged, or an axis counts the other way (y of the photos downwards: "
+            "--y-down)",
+            lambda a: a[:, [1, 0, 2]],
+        ),
+    ]
+    found += [
+        altered(
+            name,
+            f"The heights of the {who} do not fit their plan; times {factor:.5g} "
+            f"everything fits: {unit}",
+            lambda a, factor=factor: a * [1, 1, factor],
+        )
+        for name, factor, unit in UNITS
+    ]
+    if _are_degrees(at[rows]):
+        found += [
+            altered(
+                "degrees",
+                f"X and Y of the {who} are degrees ({order}): convert them to a system "
+                "in metres, with which everything fits",
+                lambda a, axes=axes: _in_metres(a, *axes),
+            )
+            for order, axes in DEGREES
+        ]
+    if (height := _common_height(at[rows])) is not None:
+        found.append(
+            altered(
+                EQUAL_HEIGHTS,
+                f"All heights of the {who} are {height:g}, which contradicts the rest: "
+                "leave unknown heights blank",
+                None,
+            )
+        )
+    for step, other in ((1, "row before"), (-1, "next row")):
+        found.append(
+            altered(
+                "rows_shifted",
+                f"Each of the {who} has the coordinates of the {other}: moved by one row "
+                "everything fits",
+                lambda a, step=step: _moved(a, step),
+            )
+        )
+    return found
+
+
+def _moved(at: Known, step: int) -> Known:
+    """The coordinates of each row that stand `step` rows further; NaN at the end."""
+    moved = np.roll(at, -step, axis=0)
+    moved[-1 if step > 0 else 0] = np.nan
+    return moved
+
+
+def _common_height(at: Known) -> float | None:
+    """The height of all points, if it is one."""
+    heights = at[np.isfinite(at[:, 2]), 2]
+    if len(heights) < FEWEST:
+        return None
+    extent = np.max(np.nanmax(at[:, :2], axis=0) - np.nanmin(at[:, :2], axis=0))
+    return float(heights[0]) if np.ptp(heights) <= EQUAL * extent else None
+
+
+def _are_degrees(at: Known) -> bool:
+    """Whether X and Y may be longitudes and latitudes, in either order."""
+    plan = at[:, :2]
+    bounds = np.nanmin(plan), np.nanmax(plan)
+    small = np.nanmax(np.ptp(plan[np.all(np.isfinite(plan), axis=1)], axis=0)) < 5
+    return bool(small and bounds[0] >= -180 and bounds[1] <= 360)
+
+
+def _in_metres(at: Known, east: int, north: int) -> Known:
+    """Longitudes and latitudes in metres about their middle, by the radii of the
+    ellipsoid there."""
+    turned = np.radians(at)
+    middle = np.nanmean(turned, axis=0)
+    square = FLATTENING * (2 - FLATTENING)
+    bent = 1 - square * np.sin(middle[north]) ** 2
+    across = AXIS / np.sqrt(bent) * np.cos(middle[north])
+    along = AXIS * (1 - square) / bent**1.5
+    away = turned - middle
+    return np.stack([away[:, east] * across, away[:, north] * along, at[:, 2]], axis=1)

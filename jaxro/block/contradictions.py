@@ -1,0 +1,141 @@
+"""What in an adjusted block contradicts what was given, as a whole: most of the control,
+a tenth of the places, most places of one photo, a sigma0 far from 1.
+
+Where one entry is wrong it is left out, and the rest is as good as before. Where this
+much does not fit, what was left out is more likely a victim than the cause.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from ..adjustment import RESULTS, critical_values
+from .adjust import BlockAdjustment
+from .given import Given, Wrong
+
+FITTING = 2 / 3
+"""Part of the known points, of the stations or of the bars that has to fit."""
+
+PLACES = 0.1
+"""Part of all places beyond which they are not single errors."""
+
+OF_PHOTO, LEAST_PLACES = 0.5, 6
+"""Part of the places of one photo, and how many it has at least."""
+
+FAR, NEVER = 2.0, 1e-6
+"""sigma0 of this factor beside 1 fails by far, if chance is smaller than this."""
+
+SUSPICIOUS = 0.05
+"""Part of all places from which on a cause is looked for."""
+
+DOUBTFUL = 1e-4
+"""Probability of sigma0 below which a cause is looked for."""
+
+
+class Fitting(NamedTuple):
+    """Of a group of what is known: how many were given, and how many fit."""
+
+    name: str
+    given: int
+    fitting: int
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether too few fit."""
+        return self.fitting < FITTING * self.given
+
+
+def groups_of(given: Given, adjusted: BlockAdjustment, wrong: Wrong) -> list[Fitting]:
+    """How many of the known points, stations and bars fit. Those that nothing of the
+    block shows do not count; those that lost their rays do not fit."""
+    ground, block = given.known, given.block
+    there = (ground.numbers_in(block) >= 0) & ~ground.check
+    there &= np.any(np.isfinite(ground.coordinates), axis=1)
+    fits = np.zeros(len(there), bool)
+    if adjusted.ground is not None:
+        fits = np.any(np.isfinite(adjusted.control_residuals), axis=1)
+    fits &= ~np.any(wrong.control, axis=1)
+    count = lambda rows: int(np.sum(rows))
+    one, other = given.lengths.numbers_in(block)
+    bars = (one >= 0) & (other >= 0)
+    used = np.isfinite(adjusted.bar_residuals) & ~wrong.bars
+    of_points, of_stations = there & ~ground.station, there & ground.station
+    return [
+        Fitting("known points", count(of_points), count(of_points & fits)),
+        Fitting("known stations", count(of_stations), count(of_stations & fits)),
+        Fitting("scale bars", count(bars), count(bars & used)),
+    ]
+
+
+def contradictions(
+    given: Given, adjusted: BlockAdjustment, wrong: Wrong, *, sigma_known: bool = True
+) -> list[str]:
+    """Sentences on what does not fit as a whole; none of a good block."""
+    said = [
+        f"Only {group.fitting} of {group.given} {group.name} fit the photos."
+        for group in groups_of(given, adjusted, wrong)
+        if group.contradicts
+    ]
+    rays = wrong.rays
+    if np.mean(rays) > PLACES:
+        said.append(
+            f"{np.sum(rays)} of {len(rays)} places ({100 * np.mean(rays):.0f} %) do not "
+            "fit the others."
+        )
+    said += [
+        f"{out} of {number} places of photo {name} do not fit the others."
+        for name, number, out in _photos_out(given, rays)
+    ]
+    if sigma_known and _is_far(adjusted):
+        said.append(
+            f"The residuals are {adjusted.sigma0:.2g} times what the standard deviations "
+            "say."
+        )
+    return said
+
+
+def is_suspicious(
+    given: Given, adjusted: BlockAdjustment, wrong: Wrong, *, sigma_known: bool = True
+) -> bool:
+    """Whether a cause is to be looked for."""
+    if adjusted.result != RESULTS.successful or not wrong.settled:
+        return True
+    groups = groups_of(given, adjusted, wrong)
+    # one wrong one of many is an error of its own
+    known = any(
+        group.given - group.fitting > max(1, group.given / 4) for group in groups
+    )
+    doubtful = sigma_known and adjusted.sigma0 > 1 and _chance(adjusted) < DOUBTFUL
+    return (
+        known
+        or bool(np.any(wrong.bars))
+        or bool(np.mean(wrong.rays) > SUSPICIOUS)
+        or doubtful
+        or bool(contradictions(given, adjusted, wrong, sigma_known=sigma_known))
+    )
+
+
+def _photos_out(
+    given: Given, rays: Bool[np.ndarray, " ray"]
+) -> list[tuple[str, int, int]]:
+    """The photos most of whose places are out: names, numbers of places, those out."""
+    block = given.block
+    number = np.bincount(block.photo, minlength=len(block.photos))
+    out = np.bincount(block.photo[rays], minlength=len(block.photos))
+    most = (out > OF_PHOTO * number) & (number >= LEAST_PLACES)
+    return [
+        (block.photos[k], int(number[k]), int(out[k])) for k in np.flatnonzero(most)
+    ]
+
+
+def _is_far(adjusted: BlockAdjustment) -> bool:
+    return adjusted.sigma0 > FAR and _chance(adjusted) < NEVER
+
+
+def _chance(adjusted: BlockAdjustment) -> float:
+    """The probability of a sigma0 that is farther from 1."""
+    freedom = adjusted.degrees_of_freedom
+    if freedom <= 0:
+        return 1.0
+    return float(critical_values.global_p(freedom * adjusted.sigma0**2, freedom))
