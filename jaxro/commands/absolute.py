@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from ..block import absolute
+from ..block.absolute_causes import find_cause
 from ..block.absolute_model import model
 from ..block.absolute_suspects import find_suspects
 from ..reports import absolute as report
@@ -216,6 +217,10 @@ def calculate(task: Task, options: Options) -> Done:
         sigma_known=task.model_deviations is not None,
         found=found[::-1] if options.second else found,
     )
+    with say_what("Looking for wrong columns of the control ..."):
+        cause = find_cause(measured, found[0])
+    if cause is not None:
+        return replace(done, cause=cause)
     if not done.is_doubtful:
         return done
     with say_what("Looking for wrong control points ..."):

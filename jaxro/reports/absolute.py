@@ -17,6 +17,12 @@ from .text import number
 POORLY = 0.1
 """Redundancy below which a control coordinate is said to be poorly checked."""
 
+CONTRADICTED = (
+    " Look at names, axes, units and coordinate systems of the control, and at the "
+    "model."
+)
+"""What is to be done about a model that its control contradicts."""
+
 SHOWN = 10
 """Names that a sentence tells of a longer list."""
 
@@ -51,6 +57,12 @@ def _head(console: Console, done: Done) -> None:
 
 def _verdict(done: Done) -> str:
     """What came of it, in one sentence or two."""
+    if done.cause is not None:
+        return (
+            f"[bold red]not usable as given[/bold red]: {escape(done.cause.sentence)}."
+        )
+    if done.contradiction:
+        return f"[bold red]not usable[/bold red]: {escape(done.contradiction)}{CONTRADICTED}"
     if not done.usable:
         return f"[bold red]{done.result}[/bold red]: {advice(done)}"
     text = f"[green]{_fits(done)}[/green]"

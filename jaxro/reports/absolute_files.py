@@ -9,6 +9,8 @@ from jaxtyping import Float, Int
 from ..adjustment import critical_values as critical
 from ..block.absolute_result import NAMES, AbsoluteOrientation
 from ..block.absolute_verdict import RESULTS
+from ..block.columns import Cause
+from ..block.contradictions import FAR, FITTING, NEVER
 from ..tables.ground import GroundPoints
 from ..tables.model import ModelPoints
 from . import files
@@ -28,7 +30,8 @@ class Done:
     not got; `approximate`: how many points are no more than that. `unit_weights`:
     nothing has a standard deviation; `sigma_known`: the model has some, so that sigma0
     is to be 1 (without them it stands for errors of the model, too). `suspects`:
-    control points without which the rest fits far better, with `sigma0_without` them.
+    control points without which the rest fits far better, with `sigma0_without` them;
+    `cause`: what is wrong with a whole column of the control.
     """
 
     title: str
@@ -45,13 +48,15 @@ class Done:
     approximate: int
     suspects: list[str] = field(default_factory=list)
     sigma0_without: float = np.nan
+    cause: Cause | None = None
 
     @property
     def is_doubtful(self) -> bool:
         """Whether some control point may be wrong: a residual is too large, or the model
         is weakly determined because all are."""
         beyond = bool(np.any(np.abs(self.control.w) > self.limit))
-        return self.result == "weakly_determined" or (self.usable and beyond)
+        weak = bool(self.first.result == RESULTS.weakly_determined)
+        return weak or (bool(self.first.usable) and beyond)
 
     @property
     def first(self) -> AbsoluteOrientation:
@@ -60,13 +65,37 @@ class Done:
 
     @property
     def result(self) -> str:
-        """The name of its result."""
+        """The name of its result, or of what is wrong with the control as a whole."""
+        if self.cause is not None:
+            return self.cause.name
+        if self.contradiction:
+            return "contradicts"
         return RESULT_NAMES[int(self.first.result._value)]
 
     @property
     def usable(self) -> bool:
         """Whether the numbers may be used."""
-        return bool(self.first.usable)
+        found = bool(self.first.usable)
+        return found and self.cause is None and not self.contradiction
+
+    @property
+    def contradiction(self) -> str:
+        """What of the control does not fit as a whole, in a sentence."""
+        known = np.any(self.control.known, axis=1)
+        fit = known & np.all(np.abs(self.control.w) <= self.limit, axis=1)
+        if bool(self.first.usable) and np.sum(fit) < FITTING * np.sum(known):
+            return (
+                f"Only {np.sum(fit)} of {np.sum(known)} control points fit the model."
+            )
+        if self.sigma_known and bool(self.first.usable) and self.freedom > 0:
+            sigma0 = float(self.first.sigma0)
+            chance = float(critical.global_p(self.freedom * sigma0**2, self.freedom))
+            if sigma0 > FAR and chance < NEVER:
+                return (
+                    f"The residuals are {sigma0:.3g} times what the standard deviations "
+                    "say."
+                )
+        return ""
 
     @property
     def freedom(self) -> int:

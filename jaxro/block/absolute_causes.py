@@ -1,0 +1,86 @@
+"""Why a model does not fit its control: whole columns that are wrong, each a hypothesis
+under which the model is placed anew."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ..adjustment import critical_values as critical
+from .absolute import orient_model
+from .absolute_model import MeasuredModel
+from .absolute_result import AbsoluteOrientation
+from .absolute_verdict import RESULTS
+from .columns import UNCERTAIN, Altered, Cause, alter
+
+LEVEL = 1e-4
+"""Probability that a cause is named although there is none."""
+
+FACTOR = 5.0
+"""By so much sigma0 falls at least."""
+
+FITS = 0.01
+"""sigma0 over the extent of the control below which a model fits that did not fit at all
+before."""
+
+LEAST_FREEDOM = 2
+"""Degrees of freedom under a cause."""
+
+
+def find_cause(measured: MeasuredModel, found: AbsoluteOrientation) -> Cause | None:
+    """The hypothesis about all known coordinates under which the sum of squares falls
+    most, far and significantly (F test, for all that are tried). A mirror image has a
+    verdict of its own."""
+    if bool(found.result == RESULTS.mirrored):
+        return None
+    known = np.asarray(measured.known)
+    if not np.any(known):
+        return None
+    at = np.where(known, np.asarray(measured.ground), np.nan)
+    tried = alter(at, np.any(known, axis=1), "control points")
+    extent = float(np.max(np.nanmax(at, axis=0) - np.nanmin(at, axis=0)))
+    best, cause = np.inf, None
+    for one in tried:
+        sigma0 = _compare(measured, found, one, extent, len(tried))
+        if sigma0 < best:
+            best, cause = sigma0, Cause(one.name, one.sentence)
+    return cause
+
+
+def _compare(
+    measured: MeasuredModel,
+    found: AbsoluteOrientation,
+    altered: Altered,
+    extent: float,
+    tries: int,
+) -> float:
+    """sigma0 under a hypothesis; infinite where it does not fall far enough."""
+    rest = orient_model(_under(measured, altered, extent))
+    freedom, sigma0 = int(rest.degrees_of_freedom), float(rest.sigma0)
+    if not bool(rest.usable) or freedom < LEAST_FREEDOM:
+        return np.inf
+    if not bool(found.usable):
+        # without any fit before there is nothing to compare with
+        typical = float(jnp.sqrt(jnp.median(measured.variance)))
+        return sigma0 if sigma0 * typical < FITS * extent else np.inf
+    before = float(found.sigma0)
+    ratio = (before / max(sigma0, 1e-300)) ** 2
+    chance = float(critical.fisher_p(ratio, int(found.degrees_of_freedom), freedom))
+    fits = before > FACTOR * sigma0 and chance * tries < LEVEL
+    return sigma0 if fits else np.inf
+
+
+def _under(measured: MeasuredModel, altered: Altered, extent: float) -> MeasuredModel:
+    """The model with its control under a hypothesis."""
+    known = np.isfinite(altered.coordinates)
+    variance = np.where(
+        altered.unknown, (UNCERTAIN * extent) ** 2, np.asarray(measured.variance)
+    )
+    return eqx.tree_at(
+        lambda m: (m.ground, m.known, m.variance),
+        measured,
+        (
+            jnp.asarray(np.where(known, altered.coordinates, 0.0)),
+            jnp.asarray(known),
+            jnp.asarray(np.where(known, variance, 1.0)),
+        ),
+    )
