@@ -4,6 +4,7 @@ told and written."""
 from ..rejection import PROCEDURES, AbstractProcedure
 from ..reports import cleaning as report, files, verdicts as decisions
 from ..reports.html.pairs import Cleaned
+from ..reports.pair import show_causes
 from ..reports.terminal import consoles, progress, say_what
 from ..tables.examples import mock_pair as example
 from ..tables.fields import TableError
@@ -58,6 +59,7 @@ def run(
         show_json(found | {"orientation": files.summary_of(results, summary)})
         return good
     jobs.show_sigma(console, job)
+    show_causes(console, results)
     report.show(console, verdicts, name, job.units.photo)
     jobs.show(console, job, results)
     console.print(written, end="", markup=False)

@@ -25,6 +25,7 @@ from ..tables.cameras import Cameras
 from ..tables.fields import TableError
 from ..tables.measured import CameraPairs, Table, tell_copies, to_ragged
 from . import neighbours, other_programs, sigma as deviation
+from .causes import name_causes, tell_causes
 from .documents import settings, show_json
 from .request import (
     MEASURED,
@@ -153,6 +154,7 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
     """What is found of every pair; of cleaned ones with the decisions."""
     plan = None if job.is_single else plan_for(job.table.lengths)
     found = solve(job.pairs, job.task, plan, told=told)
+    found = name_causes(job.pairs, found, job.task, plan)
     used, verdicts = job.pairs, None
     if found.decided is not None:
         used = used._replace(mask=used.mask & found.decided["in_use"])
@@ -167,6 +169,8 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
         if growth is None:  # the misfit tells nothing of errors that agree
             told_of["intervals"] = _intervals(job, used, found)
         found = found._replace(of_pairs=of_pairs)
+    known, unit = job.task.sigma_known, job.units.photo
+    told_of["causes"] = tell_causes(used, found.of_pairs, known, unit)
     results = make_results(
         job.table,
         job.cameras,
@@ -204,6 +208,7 @@ def run(options: Options) -> bool:
         show_json(files.summary_of(results, summary))
         return bool(results.usable.all())
     show_sigma(console, job)
+    report.show_causes(console, results)
     show(console, job, results)
     console.print(written, end="", markup=False)
     if options.file is None:

@@ -199,10 +199,10 @@ def _complete(
         assessed = _assess(pairs, of_pairs, of_points, task, plan, threads)
         of_points = of_points | {"reliability": assessed}
     used = np.add.reduceat(pairs.mask.astype(int), pairs.begins[:-1])
-    return _hide(of_pairs | {"used": used}, of_points, pairs, task)
+    return hide(of_pairs | {"used": used}, of_points, pairs, task)
 
 
-def _hide(
+def hide(
     of_pairs: dict[str, Any],
     of_points: dict[str, dict[str, Any]],
     pairs: Ragged,

@@ -65,6 +65,17 @@ class RESULTS(results.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "rejected may agree with it by chance. Measure these points again, or more "
         "points at other depths."
     )
+    mirrored = (
+        "All points fit, but lie behind the right photo: y of one photo counts the "
+        "other way (downwards), or its x and y are exchanged. With one photo mirrored "
+        "they fit, and lie in front of both. Correct the axes of that photo (y_down of "
+        "its camera) and orient again."
+    )
+    out_of_field = (
+        "No camera sees rays so far from its axis (87° and more): the coordinates, the "
+        "principal point and the focal length are not in one unit. Give all of them in "
+        "the unit of the coordinates."
+    )
 
 
 def of_adjustment(result: results.RESULTS) -> RESULTS:

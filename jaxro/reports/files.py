@@ -127,6 +127,7 @@ def _pair(one: One) -> dict[str, Any]:
         "result": one.result,
         "usable": one.usable,
         "advice": one.advice,
+        "causes": one.causes,
         "points": one.count,
         "degrees_of_freedom": one.value("degrees_of_freedom"),
         "iterations": one.value("iterations"),

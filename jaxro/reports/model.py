@@ -66,7 +66,8 @@ class Results:
     numbers of the pairs: `patterns`, `rotations` of pairs without a base, `intervals`
     by likelihood of pairs whose deviations do not say it all. `growth`: by how much
     deviations allow for neighbours that agree; None where none do. `promises`: what
-    intervals really hold after cleaning, where that was simulated."""
+    intervals really hold after cleaning, where that was simulated. `causes`: sentences
+    about units, origin and sigma0 that are to be read first."""
 
     table: Table
     cameras: CameraPairs
@@ -81,6 +82,7 @@ class Results:
     intervals: dict[int, likelihood.Interval] = field(default_factory=dict)
     growth: float | None = None
     promises: dict[int, AfterCleaning] = field(default_factory=dict)
+    causes: dict[int, list[str]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.table.names)
@@ -237,6 +239,11 @@ class One:
     def promise(self) -> AfterCleaning | None:
         """What its intervals really hold; None where that was not simulated."""
         return self.results.promises.get(self.number)
+
+    @property
+    def causes(self) -> list[str]:
+        """What is to be read before anything else of the pair."""
+        return self.results.causes.get(self.number, [])
 
     @property
     def rotation(self) -> PureRotation | None:

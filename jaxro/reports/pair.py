@@ -23,6 +23,21 @@ HIGH = 0.95
 CORRECTIONS = tuple(f"v_{name}" for name in COORDINATES)
 AXES = ("X", "Y", "Z")
 
+WRONG_AS_A_WHOLE = ("mirrored", "out_of_field")
+"""Results that name a cause, which is told first."""
+
+
+def show_causes(console: Console, results: Results) -> None:
+    """What is to be read first: of every pair what is wrong with it as a whole."""
+    named = [one for one in results if one.causes or one.result in WRONG_AS_A_WHOLE]
+    for one in named[: most_rows()]:
+        first = [one.advice] if one.result in WRONG_AS_A_WHOLE else []
+        for sentence in (*first, *one.causes):
+            console.print(
+                f"[bold red]{escape(one.name)}[/bold red]: {escape(sentence)}"
+            )
+    left_out(console, len(named), "pairs with something wrong as a whole")
+
 
 def show(console: Console, results: Results, subtitle: str) -> None:
     """One pair in full, or many as one row each."""
@@ -197,7 +212,9 @@ def _verdict(one: One) -> str:
     if not one.advice:
         return "[green]successful[/green]"
     colour = "yellow" if one.usable else "bold red"
-    return f"[{colour}]{one.result}[/{colour}]: {one.advice}"
+    # the advice about a cause stands above everything
+    advice = "see above" if one.result in WRONG_AS_A_WHOLE else one.advice
+    return f"[{colour}]{one.result}[/{colour}]: {advice}"
 
 
 def table(first: str, *numbers: str, title: str | None = None) -> Table:

@@ -1,14 +1,17 @@
 """What a command tells of a cleaned table is what the procedure found, pair by pair."""
 
+import jax
 import numpy as np
 import pytest
 import scenes
 
 import jaxro
 from jaxro.batches.padding import plan_for
+from jaxro.commands.causes import mirror, name_causes
 from jaxro.commands.solve import Task, solve
 from jaxro.geometry.elements import RelativePose
 from jaxro.rejection import PROCEDURES
+from jaxro.reports.columns import OUTCOME_NAMES, RESULT_NAMES
 from jaxro.reports.reader import report_elements
 
 POINTS = 50
@@ -73,3 +76,67 @@ def test_a_table_tells_what_the_procedure_found(pairs):
         faded |= bool(abs(plain.sigma0 / solved.sigma0 - 1) > 1e-3)
     assert len(results) >= 3
     assert faded
+
+
+def near_vertical(rng, points):
+    """Coordinates (point, 4) of a pair over hilly ground, with errors of 0.005 mm."""
+    ground = rng.uniform([-0.1, -0.6, -1.05], [0.7, 0.6, -0.95], (points, 3))
+    photos = [
+        -150 * at[:, :2] / at[:, 2:] for at in (ground, ground - [0.6, 0.05, -0.02])
+    ]
+    return np.hstack(photos) + 0.005 * rng.normal(size=(points, 4))
+
+
+IMAGES = {
+    "as it is": lambda c: c,
+    "y of the right": lambda c: c * [1, 1, 1, -1],
+    "y of the left": lambda c: c * [1, -1, 1, 1],
+    "x and y of the right": lambda c: c[:, [0, 1, 3, 2]],
+}
+"""The coordinates of a pair in axes of several kinds."""
+
+
+@pytest.mark.parametrize("cleaned", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_mirrored_photo_is_named_and_no_point_accused(cleaned):
+    """With a wrong point where pairs are cleaned, in one table with a good pair."""
+    coordinates = near_vertical(np.random.default_rng(2), 16)
+    coordinates[5, 3] += 3 * cleaned
+    pairs = jaxro.join(
+        [
+            jaxro.pair(*image(coordinates).T, focal=150.0, sigma=0.005)
+            for image in IMAGES.values()
+        ]
+    )
+    procedure = PROCEDURES["recommended"] if cleaned else None
+    task = Task(RelativePose, ("elements", "residuals"), True, procedure=procedure)
+    plan = plan_for(pairs.lengths)
+    found = name_causes(pairs, solve(pairs, task, plan), task, plan)
+    names = [RESULT_NAMES[int(k)] for k in found.of_pairs["result"]]
+    assert names == ["successful", "mirrored", "mirrored", "mirrored"]
+    assert np.all(np.isnan(found.of_pairs["bx"][1:]))
+    if cleaned:
+        assert found.decided is not None and found.outcome is not None
+        out = np.flatnonzero(~found.decided["kept"])
+        np.testing.assert_array_equal(out, [5])
+        assert OUTCOME_NAMES[int(found.outcome[0])] == "finished"
+        assert {OUTCOME_NAMES[int(k)] for k in found.outcome[1:]} == {"not_oriented"}
+
+
+def test_mirroring_is_an_involution_and_mirrors_the_covariances():
+    rng = np.random.default_rng(3)
+    root = 0.01 * (np.eye(2) + 0.3 * rng.normal(size=(8, 2, 2)))
+    covariances = root @ np.swapaxes(root, 1, 2)
+    given = near_vertical(rng, 8)
+    pairs = jaxro.join(
+        [jaxro.pair(*given.T, focal=150.0, covariances=(covariances, covariances))]
+    )
+    image = mirror(pairs)
+    sign = np.array([1, -1])
+    assert image.roots is not None
+    np.testing.assert_allclose(
+        image.sigma[:, None, None] ** 2 * image.roots.cofactors[1],
+        covariances * sign[:, None] * sign,
+    )
+    again = mirror(image)
+    for one, other in zip(jax.tree.leaves(pairs), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(one, other)

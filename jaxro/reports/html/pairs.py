@@ -96,7 +96,7 @@ def _page_of_one(
         title=f"Relative orientation of {one.name}",
         about=f"{one.count} points{_rejected_in_words(cleaned)}, {_cameras(one)}",
         verdict=_verdict(one, cleaned, 0),
-        mind=reliability.sentences(one),
+        mind=[*one.causes, *reliability.sentences(one)],
         sections=[*parts, _meanings()],
         settings=settings,
     )
@@ -215,7 +215,7 @@ def _page_of_many(
         about=f"{len(results.table.points)} points{_rejected_in_words(cleaned)}, "
         f"{usable} pairs usable",
         verdict=_verdict_of_many(results, cleaned),
-        mind=reliability.sentences_of_many(results),
+        mind=[*_causes(results), *reliability.sentences_of_many(results)],
         sections=[
             Section("Overview", _overview(results, cleaned, order, set(told))),
             Section("The worst pairs", [_worst_note(results, len(told))]),
@@ -313,6 +313,12 @@ def _advice(results: Results) -> list[Block]:
         )
         for name, members in found.items()
     ]
+
+
+def _causes(results: Results) -> list[str]:
+    """What is wrong with pairs as a whole."""
+    told = results.causes
+    return [f"{One(results, k).name}: {said}" for k in told for said in told[k]]
 
 
 def _anchor(pair: int) -> str:
