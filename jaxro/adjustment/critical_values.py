@@ -277,6 +277,21 @@ def global_p(squares: Given, freedom: Given) -> Scalar:
     return xp.where(below < above, 2 * below, 2 * above)
 
 
+BEYOND_CHANCE = 0.001
+"""Probability of a sigma0 below which the given standard deviations are too small."""
+
+
+def trusted_sigma0(sigma0: Given, freedom: Given) -> Scalar:
+    """What given standard deviations are multiplied with: 1 unless the estimated sigma0
+    is larger than chance allows, as few degrees of freedom tell less of it than these
+    do."""
+    xp, _, sigma0, freedom = _numbers(sigma0, freedom)
+    some = xp.maximum(freedom, 1.0)
+    larger = (freedom > 0) & (sigma0 > 1)
+    chance = global_p(some * sigma0**2, some)
+    return xp.where(larger & (chance < BEYOND_CHANCE), sigma0, 1.0)
+
+
 def fisher_p(f: Given, above: Given, below: Given) -> Scalar:
     """The probability that F with `above` degrees of freedom of the numerator and
     `below` of the denominator is larger than `f`; NaN where one of them is not

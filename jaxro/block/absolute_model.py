@@ -94,6 +94,7 @@ def model(
     ground_sigma: Float[ArrayLike, "..."] = 1.0,
     sigma: Float[ArrayLike, "..."] | None = None,
     covariance: Float[np.ndarray, "..."] | None = None,
+    factors: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> MeasuredModel:
     """A `MeasuredModel`.
 
@@ -101,7 +102,8 @@ def model(
     standard deviations, a number or any array that broadcasts to (point, 3): 1 for unit
     weights, 0 without error. Of the model: `sigma`, standard deviations of the same
     shapes, or `covariance`, (point, 3, 3) of each point or (3 point, 3 point) of all of
-    them together; without both it is free of error. Points with a model coordinate that
+    them together, or `factors`, its `own` (point, 3, 3) and its `common` (point, 3, any)
+    ones; without all of them it is free of error. Points with a model coordinate that
     is not finite have no control. Raises ValueError for shapes that differ, and for
     what is no covariance.
     """
@@ -113,8 +115,8 @@ def model(
             "absolute.model: model points and ground coordinates are arrays of shape "
             f"(point, 3) of the same points, got {x.shape} and {given.shape}"
         )
-    if sigma is not None and covariance is not None:
-        raise ValueError("absolute.model: sigma or covariance, not both")
+    if sum(given is not None for given in (sigma, covariance, factors)) > 1:
+        raise ValueError("absolute.model: one of sigma, covariance and factors")
     deviation = xp.broadcast_to(xp.asarray(ground_sigma, float), x.shape)
     there = xp.all(xp.isfinite(x), axis=1)[:, None]
     known = xp.isfinite(given) & xp.isfinite(deviation) & (deviation >= 0) & there
@@ -123,6 +125,8 @@ def model(
     if sigma is not None:
         spread = xp.broadcast_to(xp.asarray(sigma, float), x.shape)
         own = spread[:, :, None] * np.eye(3)[None]
+    if factors is not None:
+        own, common = factors
     if covariance is not None:
         own, common = _parts(np.asarray(covariance, float), number)
     return MeasuredModel(

@@ -31,6 +31,12 @@ class RESULTS(results.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A zone has no point, so that its focal length is unknown. Choose fewer zones, "
         "or measure points in all of them."
     )
+    contradicted = (
+        "The coordinates are more than ten times less accurate than their standard "
+        "deviations say: that is no error of measurement. Object points or places are "
+        "exchanged or in another unit, the camera is not what was given, or sigma is "
+        "not in the unit of the coordinates."
+    )
 
 
 def of_adjustment(result: results.RESULTS) -> RESULTS:

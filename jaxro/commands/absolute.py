@@ -196,7 +196,8 @@ def calculate(task: Task, options: Options) -> Done:
         task.model.coordinates,
         coordinates,
         ground_sigma=sigma,
-        sigma=task.model_deviations,
+        sigma=task.model_deviations if task.model.factors is None else None,
+        factors=task.model.factors,
     )
     with say_what("Placing the model ..."):
         found = [jax.tree.map(np.asarray, one) for one in absolute.solutions(measured)]

@@ -45,6 +45,16 @@ double it, so that images of different lengths share their programs."""
 SUPPORT = 4
 """Points that a focal length of a zone needs."""
 
+CHOICE = 10
+"""Degrees of freedom that the largest model leaves, from which on the evidence may choose
+without standard deviations: with fewer a large model makes residuals vanish."""
+
+CONTRADICTED = 10.0
+"""Ratio of sigma0 to the standard deviations given that is no error of measurement."""
+
+FEW_CHECKS = 3
+"""Degrees of freedom from which on sigma0 is not so large by chance."""
+
 MIRRORED = 2.0
 """How many times larger sigma0 is with the wrong direction of y, at least."""
 
@@ -161,10 +171,14 @@ def calibrate(options: Options, task: Task, told: Callable[..., None]) -> Done:
             told(image + 1)
         with say_what("Comparing distortions ..."):
             differences = compare_distortions(task, images)
+        few = [not rows[1:] and len(task.models) > 1 for rows in compared.values()]
         done = Done(
             photos=[one.photo for one in images],
             variants=compared,
-            chosen=len(task.models) > 1,
+            chosen=len(task.models) > 1 and not all(few),
+            few=tuple(
+                name for name, is_few in zip(compared, few, strict=True) if is_few
+            ),
             differences=differences,
             **common,
         )
@@ -180,14 +194,28 @@ def calibrate_alone(
     rows = task.named.rows_of(image)
     measured = one_image(task, rows, options.y_down, room=_room(task.named))
     check_direction(options, task, measured)
+    models = _testable_models(task, len(rows))
     with say_what("Comparing models ..."):
-        found, compared = calibration.choose(measured, task.models, task.known)
+        found, compared = calibration.choose(measured, models, task.known)
     sigma = float(np.sqrt(np.mean(task.sigma[rows] ** 2)))
     one = Alone(_photo(task, image, found), compared)
     return one, variants(compared, sigma)
 
 
+def _testable_models(task: Task, points: int) -> tuple[Model, ...]:
+    """The models that an image of so many points can choose among: the simplest one
+    where neither standard deviations nor redundancy would stop a larger one."""
+    largest = max(model.unknowns for model in task.models)
+    if task.sigma_known or 2 * points - largest >= CHOICE:
+        return task.models
+    return task.models[:1]
+
+
 def _photo(task: Task, image: int, found: Calibration) -> Photo:
+    far_off = float(found.sigma0) > CONTRADICTED
+    checked = int(found.degrees_of_freedom) >= FEW_CHECKS
+    if task.sigma_known and far_off and checked and bool(found.usable):
+        found = replace(found, result=calibration.RESULTS.contradicted)
     named, rows = task.named, task.named.rows_of(image)
     name = named.images[image]
     camera = name if not task.together else named.cameras[named.camera[image]]

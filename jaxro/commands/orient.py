@@ -10,7 +10,7 @@ from rich.console import Console
 
 from .. import __version__
 from ..batches import table_neighbours
-from ..batches.padding import plan_for
+from ..batches.padding import Plan, plan_for
 from ..batches.ragged import Ragged
 from ..batches.table_noise import TableNoise
 from ..rejection import AbstractProcedure
@@ -27,6 +27,7 @@ from ..tables.measured import CameraPairs, Table, tell_copies, to_ragged
 from . import neighbours, other_programs, sigma as deviation
 from .causes import name_causes, tell_causes
 from .documents import settings, show_json
+from .model_accuracy import model_errors
 from .request import (
     MEASURED,
     SYSTEMS,
@@ -169,6 +170,8 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
         if growth is None:  # the misfit tells nothing of errors that agree
             told_of["intervals"] = _intervals(job, used, found)
         found = found._replace(of_pairs=of_pairs)
+    if job.options.out is not None:
+        found = _with_model_errors(job, used, found, plan)
     known, unit = job.task.sigma_known, job.units.photo
     told_of["causes"] = tell_causes(used, found.of_pairs, known, unit)
     results = make_results(
@@ -181,6 +184,20 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
         **told_of,
     )
     return results, verdicts
+
+
+def _with_model_errors(
+    job: Job, used: Ragged, found: Found, plan: Plan | None
+) -> Found:
+    """What is found with the standard deviations of the model points, of which a least
+    squares orientation tells."""
+    if job.options.residual != "rigorous" or "points" not in found.of_points:
+        return found
+    points, task = found.of_points["points"], job.task
+    errors = model_errors(
+        used, found.of_pairs, points, task.system, task.sigma_known, plan
+    )
+    return found._replace(of_points=found.of_points | {"points": points | errors})
 
 
 def _intervals(job: Job, used: Ragged, found: Found) -> dict[int, Any]:

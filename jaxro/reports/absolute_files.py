@@ -103,11 +103,13 @@ class Done:
 
     @property
     def sigma0(self) -> float | None:
-        """What cofactors are multiplied with: the estimated sigma0 or, where it does not
-        exist, 1 for given standard deviations; None without both."""
-        if self.freedom > 0:
-            return float(self.first.sigma0)
-        return 1.0 if self.sigma_known else None
+        """What cofactors are multiplied with: 1 for given standard deviations unless the
+        estimated sigma0 is larger than chance allows, as a few degrees of freedom tell
+        less of it than these do; without them the estimated one, None without both."""
+        found = float(self.first.sigma0)
+        if not self.sigma_known:
+            return found if self.freedom > 0 else None
+        return float(critical.trusted_sigma0(found, self.freedom))
 
     @property
     def limit(self) -> float:

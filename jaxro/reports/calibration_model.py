@@ -232,7 +232,8 @@ class Done:
     calibrated alone, or of all images together. `chosen`: whether the evidence chose
     the model. `zones`: the tests of images with zones. `differences`: pairs of images
     whose distortions were compared. `known_has_deviations`: whether a principal place
-    or focal length was given with a standard deviation."""
+    or focal length was given with a standard deviation. `few`: images with too few
+    points for a choice, which got the simplest model."""
 
     title: str
     unit: str
@@ -248,6 +249,7 @@ class Done:
     known_has_deviations: bool = False
     zones: dict[str, TestedZones] = field(default_factory=dict)
     differences: list[Compared] = field(default_factory=list)
+    few: tuple[str, ...] = ()
 
     @property
     def cameras(self) -> list[Photo]:

@@ -56,6 +56,11 @@ def decision(done: Done, one: Photo) -> str:
             )
         return f"{text}."
     name = _name_of(one)
+    if one.name in done.few:
+        return (
+            f"{name[0].upper()}{name[1:]}: too few points for a choice among models "
+            "without standard deviations. Measure more points, or give --sigma."
+        )
     if not done.chosen:
         return f"{name[0].upper()}{name[1:]}, as asked."
     return f"{name[0].upper()}{name[1:]} {'are' if 'lengths' in name else 'is'} enough."
@@ -168,7 +173,7 @@ def _of_fit(done: Done, one: Photo) -> list[str]:
                 f"The coordinates are {1 / sigma0:.1f} times more accurate than their "
                 f"sigma says (probability {probability}): sigma is too large."
             )
-    if freedom < FEW:
+    if freedom < FEW and one.name not in done.few:
         said.append(
             f"{freedom} degree{'s' * (freedom != 1)} of freedom: few points for a "
             "choice among models. Measure more points."

@@ -197,6 +197,13 @@ RESIDUALS = (
     Column("in_front", of=_orientation("in_front"), there="shown"),
 )
 
+OWN = tuple(f"own_{a}{b}" for k, a in enumerate("XYZ") for b in "XYZ"[: k + 1])
+"""The root of the covariance that a model point has for itself, row by row."""
+
+COMMON = tuple(f"common_{axis}{k}" for axis in "XYZ" for k in range(1, 6))
+"""What the errors of the elements do to a model point: the derivatives by them times
+the root of their covariance, row by row."""
+
 POINTS = (
     PAIR,
     POINT,
@@ -208,6 +215,10 @@ POINTS = (
             there="usable",
         )
         for k, axis in enumerate("XYZ")
+    ),
+    *(
+        Column(name, Kind.MODEL, there="usable", only="csv")
+        for name in ("sX", "sY", "sZ", *OWN, *COMMON)
     ),
 )
 

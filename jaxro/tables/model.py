@@ -2,7 +2,13 @@
 
 point, X, Y, Z, as `jaxro orient` and `jaxro clean` write them (points.csv: pair, and
 the unit of the model behind the names, as in X_bases); optionally sigma, or sX, sY, sZ,
-the standard deviations of a point.
+the standard deviations of a point. Beside these own_XX to own_ZZ and common_X1 to
+common_Z5 may stand, all of them: the error of a point is
+
+    own z + common e,
+
+with own, a lower triangular matrix, and standard normal numbers: three of each point, z,
+and five that all points of the pair share, e.
 """
 
 import csv
@@ -10,6 +16,7 @@ import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,17 +25,29 @@ from . import fields
 from .fields import Columns, TableError
 from .ground import AXES, DEVIATIONS, SHORT
 
-NUMBERS = (*AXES, *DEVIATIONS, "sigma")
-WITH_UNIT = re.compile(r"([xyz])_(\w+)")
+OWN = tuple(f"own_{a}{b}" for k, a in enumerate("xyz") for b in "xyz"[: k + 1])
+COMMON = tuple(f"common_{axis}{k}" for axis in "xyz" for k in range(1, 6))
+FACTORS = (*OWN, *COMMON)
+NUMBERS = (*AXES, *DEVIATIONS, "sigma", *FACTORS)
+WITH_UNIT = re.compile(r"(s?[xyz]|own_[xyz]{2}|common_[xyz][1-5])_(\w+)")
 SHOWN = 5
 """Names that an error tells of a longer list."""
+
+
+class Factors(NamedTuple):
+    """What makes the errors of model points of standard normal numbers: three of each
+    point for itself, and five that all share."""
+
+    own: Float[np.ndarray, "point 3 3"]
+    common: Float[np.ndarray, "point 3 5"]
 
 
 @dataclass(frozen=True)
 class ModelPoints:
     """The points of one model with their names: coordinates and their standard
     deviations (None where the table has none), the line of each; the name of the pair,
-    and the unit of the coordinates ("" where the table does not say it)."""
+    and the unit of the coordinates ("" where the table does not say it); the `factors` of
+    the errors, if the table has them."""
 
     file: str
     pair: str
@@ -37,6 +56,7 @@ class ModelPoints:
     coordinates: Float[np.ndarray, "point 3"]
     deviations: Float[np.ndarray, "point 3"] | None
     lines: Int[np.ndarray, " point"]
+    factors: Factors | None = None
 
 
 def read(path: Path, pair: str | None = None) -> ModelPoints:
@@ -97,6 +117,7 @@ def parse(
         coordinates=np.stack([at[axis] for axis in AXES], axis=1),
         deviations=_deviations(at, file),
         lines=np.array([line for line, _ in points.values()]),
+        factors=_factors(at, file),
     )
 
 
@@ -113,7 +134,7 @@ def _columns(text: str) -> tuple[Columns, str]:
             units.append(found[2])
     columns = Columns(
         ("point", *AXES),
-        ("pair", *DEVIATIONS, "sigma"),
+        ("pair", *DEVIATIONS, "sigma", *FACTORS),
         short,
         texts=("pair", "point"),
     )
@@ -154,12 +175,33 @@ def _deviations(
     return np.stack([at[column] for column in columns], axis=1)
 
 
+def _factors(at: dict[str, np.ndarray], file: str) -> Factors | None:
+    """The factors of the errors. Raises TableError where some of them are missing."""
+    there = [column for column in FACTORS if column in at]
+    if not there:
+        return None
+    missing = [column for column in (*DEVIATIONS, *FACTORS) if column not in at]
+    if missing:
+        raise TableError(
+            file,
+            column=there[0],
+            found=f"it without {missing[0]}",
+            expected="all of own_XX to own_ZZ and common_X1 to common_Z5 with sX, sY and "
+            "sZ, or none of them",
+        )
+    rows, places = np.tril_indices(3)
+    own = np.zeros((len(at[there[0]]), 3, 3))
+    own[:, rows, places] = np.stack([at[column] for column in OWN], axis=1)
+    common = np.stack([at[column] for column in COMMON], axis=1)
+    return Factors(own, common.reshape(-1, 3, 5))
+
+
 def _number(text: str, file: str, line: int, column: str) -> float:
     """A number; a standard deviation is positive. Raises TableError."""
     value = fields.number(
         text, file, line, column, "; delete the line to leave the point out"
     )
-    if column not in AXES and value <= 0:
+    if column in (*DEVIATIONS, "sigma") and value <= 0:
         raise TableError(
             file,
             line=line,

@@ -94,6 +94,26 @@ def test_models_are_those_that_orient_writes():
     np.testing.assert_array_equal(one.deviations, [[0.5, 0.5, 0.5]])
 
 
+def test_what_the_errors_of_model_points_share_is_read():
+    """The root of the own covariance row by row, and five columns in common."""
+    names = [*model.OWN, *model.COMMON]
+    head = ",".join(
+        ["point,X_mm,Y_mm,Z_mm,sX_mm,sY_mm,sZ_mm", *(f"{n}_mm" for n in names)]
+    )
+    numbers = ",".join(map(str, range(1, 22)))
+    read = model.parse(f"{head}\na,1,2,3,1,1,1,{numbers}\n", "points.csv", "points")
+    assert read.factors is not None and read.unit == "mm"
+    np.testing.assert_array_equal(
+        read.factors.own[0], [[1, 0, 0], [2, 3, 0], [4, 5, 6]]
+    )
+    np.testing.assert_array_equal(
+        read.factors.common[0], np.arange(7, 22).reshape(3, 5)
+    )
+    with pytest.raises(TableError, match="column own_xx: found it without own_yx"):
+        text = "point,X,Y,Z,sX,sY,sZ,own_XX\na,1,2,3,1,1,1,1\n"
+        model.parse(text, "points.csv", "points")
+
+
 BAD_MODEL = {
     "several": ("", "", None, "--pair: found models of 2 pairs"),
     "other": (
