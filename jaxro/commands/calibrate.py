@@ -214,7 +214,10 @@ def _testable_models(task: Task, points: int) -> tuple[Model, ...]:
 def _photo(task: Task, image: int, found: Calibration) -> Photo:
     far_off = float(found.sigma0) > CONTRADICTED
     checked = int(found.degrees_of_freedom) >= FEW_CHECKS
-    if task.sigma_known and far_off and checked and bool(found.usable):
+    # what looks weak by residuals of this size may be determined well
+    weak = found.result == calibration.RESULTS.weakly_determined
+    ended = bool(found.usable) or bool(weak)
+    if task.sigma_known and far_off and checked and ended:
         found = replace(found, result=calibration.RESULTS.contradicted)
     named, rows = task.named, task.named.rows_of(image)
     name = named.images[image]

@@ -125,7 +125,7 @@ def _reach(pairs: Ragged) -> np.ndarray:
 def _find_no_lens(pairs: Ragged) -> list[int]:
     """The pairs with points that no camera sees."""
     far = np.flatnonzero(_reach(pairs) > axes.NO_LENS)
-    return [int(k) for k in far if any(map(axes.is_no_lens, *_photos(pairs, k)))]
+    return [k for k in far.tolist() if any(map(axes.is_no_lens, *_photos(pairs, k)))]
 
 
 def _find_strange(

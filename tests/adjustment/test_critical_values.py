@@ -249,3 +249,9 @@ def test_values_under_jit_are_the_same():
         np.testing.assert_allclose(
             jax.jit(function)(level, freedom), function(level, freedom), rtol=1e-12
         )
+
+
+def test_a_sigma0_within_chance_is_not_trusted():
+    sigma0 = np.array([2.0, 2.0, 0.3, np.nan, 1.05])
+    found = critical.trusted_sigma0(sigma0, np.array([2, 40, 40, 0, 1000]))
+    np.testing.assert_array_equal(found, [1.0, 2.0, 1.0, 1.0, 1.0])

@@ -49,11 +49,11 @@ def test_the_example_is_true_within_its_deviations(tables, tmp_path):
     measured = model(read.coordinates, given, ground_sigma=0.03, sigma=read.deviations)
     found = absolute.orient_model(measured).check()
     np.testing.assert_allclose(places, found.points, rtol=1e-10)
-    np.testing.assert_allclose(deviations, found.point_deviations(), rtol=1e-6)
+    np.testing.assert_allclose(deviations, found.point_deviations(1.0), rtol=1e-6)
     (elements,) = rows(out / "absolute.csv")
     np.testing.assert_allclose(float(elements["scale"]), found.scale, rtol=1e-9)
     np.testing.assert_allclose(
-        float(elements["s_omega_deg"]), np.degrees(found.deviations()[1]), rtol=1e-6
+        float(elements["s_omega_deg"]), np.degrees(found.deviations(1.0)[1]), rtol=1e-6
     )
     sigma0, freedom = float(found.sigma0), int(found.degrees_of_freedom)
     assert f"sigma0 {sigma0:.2f}, {freedom} degrees of freedom" in told.stdout
