@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxro import block
-from jaxro.block.network import Start
 from jaxro.block.adjust_chained import start_from
+from jaxro.block.network import Start
 
 from .calibration import CENTRE, FOCAL, SIGMA, demand, measured_in, network, seconds
 from .common import Size, ratio

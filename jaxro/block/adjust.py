@@ -205,7 +205,8 @@ class BlockAdjustment:
         if self.inner is None:
             return places
         rays = len(places)
-        here = Station(np.tile([1.0, 0.0, 0.0, 0.0], (rays, 1)), np.zeros((rays, 3)))
+        turned = np.tile([1.0, 0.0, 0.0, 0.0], (rays, 1))
+        here = Station(*jax.device_put((turned, np.zeros((rays, 3)))))
         ahead = np.concatenate([places, np.ones((rays, 1))], axis=1)
         scale = 1.0
         if self.inner.focal:

@@ -33,7 +33,7 @@ from .wrong import CLEAR
 CUT = CLEAR**2
 """What a coordinate costs at most, and an unknown."""
 
-BETTER = 0.7
+BETTER = 0.9
 """Part of D that a cause leaves at most."""
 
 CLEARLY = 1.5

@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..batches.ragged import Ragged, clean_ragged
+from ..orientation.axes import tell_field
 from ..rejection import Recommended, Rejection
 from .adjust import BlockAdjustment
-from .adjust_chained import adjust_chained
+from .adjust_chained import Outcome, adjust_chained
 from .bars import Bars
 from .chain import Chained, Oriented, chain, models_of
 from .columns import Cause
@@ -71,6 +72,29 @@ def orient_block(
     block = from_pairs(left, right, pairs, points) if more is None else more
     chained, usable = chain_pairs(block, left, right, pairs)
     given = Given(block, ground, inner, bars)
+    judged = adjust_and_judge(given, chained, level, components, sigma_known)
+    return OrientedBlock(*judged.outcome, usable, judged.contradictions, judged.cause)
+
+
+class Judged(NamedTuple):
+    """An adjusted block, what of that which was given does not fit as a whole, and the
+    cause after which all of it fits. `outcome` is that of what was given; where this
+    could not be adjusted, that under the cause."""
+
+    outcome: Outcome
+    contradictions: tuple[str, ...] = ()
+    cause: Cause | None = None
+
+
+def adjust_and_judge(
+    given: Given,
+    chained: Chained,
+    level: float = 0.05,
+    components: bool = False,
+    sigma_known: bool = True,
+) -> Judged:
+    """Adjust a chained block and, where much of what was given does not fit, look for
+    the cause. Raises `TooLittleControl`."""
     outcome, refused = None, None
     try:
         outcome = adjust_chained(given, chained, level, components)
@@ -80,16 +104,28 @@ def orient_block(
         rest = given, outcome.adjusted, outcome.wrong
         suspicious = is_suspicious(*rest, sigma_known=sigma_known)
         if not suspicious and not is_misplaced(given, chained):
-            return OrientedBlock(*outcome, usable)
-    found = find_cause(given, chained, outcome, level, sigma_known=sigma_known)
-    cause, explained = (None, outcome) if found is None else found
+            return Judged(outcome)
+    cause, explained = _of_field(given), None
+    if cause is None:
+        found = find_cause(given, chained, outcome, level, sigma_known=sigma_known)
+        cause, explained = (None, None) if found is None else found
     outcome = explained if outcome is None else outcome
     if outcome is None:
         assert refused is not None
         raise refused
     rest = given, outcome.adjusted, outcome.wrong
     against = contradictions(*rest, sigma_known=sigma_known)
-    return OrientedBlock(*outcome, usable, tuple(against), cause)
+    return Judged(outcome, tuple(against), cause)
+
+
+def _of_field(given: Given) -> Cause | None:
+    """A focal length in another unit than the places."""
+    block = given.block
+    places = np.stack([block.x, block.y], axis=1) / block.focal[block.photo][:, None]
+    told = tell_field(places, 1.0)
+    if told is None:
+        return None
+    return Cause("out_of_field", told[0].upper() + told[1:].rstrip(".?"))
 
 
 def chain_pairs(

@@ -115,7 +115,8 @@ def _without_bars(
     prepared = _prepare(given, start)
     found = settle(prepared)
     wrong = _far(prepared, found)
-    if np.mean(wrong.rays[prepared.numbered.rays]) > MOST:
+    used = wrong.rays[prepared.numbered.rays]
+    if found.result != RESULTS.successful or np.mean(used) > MOST:
         lost = found._replace(result=RESULTS.diverged)
         return conclude(prepared, lost), nothing
     adjusted = adjust_rest(given, prepared.start_at(found), wrong)
@@ -247,6 +248,8 @@ def settle(prepared: Prepared) -> Minimum:
     for k in range(ABSOLUTE + ROUNDS):
         problem = problem.at(found.problem)
         sizes = _sizes(problem)
+        if not all(np.all(np.isfinite(s)) for s in sizes):
+            return found._replace(result=RESULTS.diverged)
         if k < ABSOLUTE:
             weights = [1 / np.maximum(s, 1.0) for s in sizes]
         else:
@@ -254,7 +257,7 @@ def settle(prepared: Prepared) -> Minimum:
             both = zip(sizes, scales, strict=True)
             weights = [(c**2 / (c**2 + s**2)) ** 2 for s, c in both]
         found = minimise(problem.weighted(weights), datum=datum, max_steps=2)
-    return found._replace(problem=problem.at(found.problem))
+    return found._replace(problem=problem.at(found.problem), result=RESULTS.successful)
 
 
 def _sizes(problem: Problem) -> list[Float[np.ndarray, " _"]]:

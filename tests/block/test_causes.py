@@ -1,0 +1,200 @@
+"""Whole columns that are wrong, in blocks: by simulation, the chain being the truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxro import block
+from jaxro.block.adjust_chained import adjust_chained
+from jaxro.block.bars import bars
+from jaxro.block.columns import alter
+from jaxro.block.contest import is_misplaced
+from jaxro.block.contradictions import contradictions, is_suspicious
+from jaxro.block.orient_block import adjust_and_judge
+from jaxro.block.wrong_points import decide
+
+FOOT = 0.3048
+PLACE = np.array([435_000.0, 4_566_000.0, 0.0])
+"""Where the block lies."""
+
+
+def strip(seed=3, stations=False):
+    """A strip with its control, and its stations, on the ground."""
+    mock = block.mock_block(seed, block.Flight(models=6), control_every=2)
+    names, at = list(mock.ground.points), mock.ground.coordinates + PLACE
+    sigma, of_stations = mock.ground.sigma, np.zeros(len(names), bool)
+    if stations:
+        centres = mock.photos.centres + PLACE
+        noise = np.random.default_rng(seed).normal(0, 0.1, centres.shape)
+        names += list(mock.block.photos)
+        at = np.concatenate([at, centres + noise])
+        sigma = np.concatenate([sigma, np.full(centres.shape, 0.1)])
+        of_stations = np.append(of_stations, np.ones(len(centres), bool))
+    known = block.ground(names, at, sigma, station=of_stations)
+    return mock, block.Given(mock.block, known)
+
+
+def with_coordinates(given, change, rows=None):
+    at = given.ground.coordinates.copy()
+    rows = np.ones(len(at), bool) if rows is None else rows
+    at[rows] = change(at[rows])
+    return given._replace(ground=given.ground._replace(coordinates=at))
+
+
+def cause_of(mock, given):
+    """The cause of a block that is not to be used."""
+    return adjust_and_judge(given, mock.photos).cause
+
+
+def in_degrees(at):
+    """Longitude and latitude of a plane on an ellipsoid, near enough."""
+    away = (at[:, :2] - PLACE[:2]) / [111_320 * np.cos(np.radians(41)), 111_050]
+    return np.column_stack([9 + away[:, 0], 41 + away[:, 1], at[:, 2]])
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("mirrored", lambda at: at[:, [1, 0, 2]]),
+        ("heights_in_feet", lambda at: at / [1, 1, FOOT]),
+        ("plan_in_feet", lambda at: at * [1, 1, FOOT]),
+        ("heights_equal", lambda at: at * [1, 1, 0]),
+        ("degrees", in_degrees),
+    ],
+)
+def test_columns_of_control_are_named(name, change):
+    mock, given = strip()
+    cause = cause_of(mock, with_coordinates(given, change))
+    assert cause is not None and cause.name == name
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("stations_shifted", lambda at: at + np.array([0, 0, 45])),
+        ("rows_shifted", lambda at: np.roll(at, 1, axis=0)),
+    ],
+)
+def test_columns_of_stations_are_named(name, change):
+    mock, given = strip(stations=True)
+    wrong = with_coordinates(given, change, given.ground.station)
+    cause = cause_of(mock, wrong)
+    assert cause is not None and cause.name == name
+
+
+def test_a_good_block_has_no_cause():
+    """Nor one with a single wrong known point, which is left out by name."""
+    mock, given = strip(stations=True)
+    digit = given.ground.coordinates.copy()
+    digit[4, 0] += 100
+    for ground, names in (
+        (given.ground, []),
+        (given.ground._replace(coordinates=digit), [given.ground.points[4]]),
+    ):
+        found = adjust_chained(given._replace(ground=ground), mock.photos)
+        left_out = np.flatnonzero(np.any(found.wrong.control, axis=1))
+        assert [ground.points[k] for k in left_out] == names
+        rest = given._replace(ground=ground), found.adjusted, found.wrong
+        assert not is_suspicious(*rest) and not contradictions(*rest)
+        assert not is_misplaced(rest[0], mock.photos)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("focal", lambda m: m._replace(focal=np.full(len(m.focal), 135.0))),
+        ("principal", lambda m: m._replace(x=m.x + 1.5, y=m.y - 0.8)),
+        ("sigma", lambda m: m._replace(sigma=m.sigma / 10)),
+    ],
+)
+def test_cameras_and_standard_deviations_are_named(name, change):
+    mock, given = strip()
+    cause = cause_of(mock, given._replace(block=change(mock.block)))
+    assert cause is not None and cause.name == name
+    if name == "focal":
+        value, deviation = (
+            float(word.strip(",")) for word in np.array(cause.sentence.split())[[6, 8]]
+        )
+        assert abs(value - 153) < 4 * deviation < 4
+
+
+def test_contradictions_are_told_where_no_cause_is_known():
+    """Half of the control in another system, by 30 m."""
+    mock, given = strip()
+    some = np.arange(len(given.ground.points)) % 2 == 0
+    wrong = with_coordinates(given, lambda at: at + np.array([30, -20, 0]), some)
+    found = adjust_chained(wrong, mock.photos)
+    said = contradictions(wrong, found.adjusted, found.wrong)
+    assert any("known points fit the photos" in sentence for sentence in said)
+
+
+def test_a_bar_is_judged_by_the_block_without_it():
+    """The wrong one of three is left out, and no ray in its place; two that contradict
+    each other are both told."""
+    mock, given = strip()
+    given = given._replace(ground=None)
+    at = dict(zip(mock.block.points, mock.points, strict=True))
+    ends = [("t20", "t40"), ("t25", "t38"), ("t30", "t46")]
+    length = np.array([np.linalg.norm(at[a] - at[b]) for a, b in ends])
+    length[0] += 10
+    some = lambda rows: bars(
+        *zip(*[ends[k] for k in rows], strict=True), length[rows], 0.01
+    )
+    found = adjust_chained(given._replace(bars=some([0, 1, 2])), mock.photos)
+    assert found.wrong.bars.tolist() == [True, False, False]
+    assert not np.any(found.wrong.rays)
+    off = (
+        np.linalg.norm(
+            found.adjusted.coordinates[mock.block.points.index("t30")]
+            - found.adjusted.coordinates[mock.block.points.index("t46")]
+        )
+        - length[2]
+    )
+    assert abs(off) < 0.2
+    both = given._replace(bars=some([0, 2]))
+    found = adjust_chained(both, mock.photos)
+    assert contradictions(both, found.adjusted, found.wrong)
+
+
+def test_rays_that_cannot_be_told_apart_are_left_out_together():
+    """A parallax of a point on two photos is in either of them; among four rays the wrong
+    one is found."""
+    mock, given = strip()
+    measured = mock.block
+    photos = np.bincount(measured.point, minlength=len(measured.points))
+    ties = np.array([name.startswith("t") for name in measured.points])
+    found = adjust_chained(given, mock.photos).adjusted
+    for number, alone in ((2, False), (3, True)):
+        point = int(np.flatnonzero(ties & (photos == number))[2])
+        rays = np.flatnonzero(measured.point == point)
+        y = measured.y.copy()
+        y[rays[0]] += 0.2
+        moved = replace(found, block=measured._replace(y=y))
+        flagged = np.zeros(len(y), bool)
+        flagged[rays[-1]] = True
+        out = decide(moved, flagged)
+        assert out[rays[0]] and np.sum(out) == (1 if alone else number)
+
+
+def test_hypotheses_undo_what_they_name():
+    """On numbers alone."""
+    rng = np.random.default_rng(1)
+    at = PLACE + rng.uniform(0, 1, (8, 3)) * [3000, 2000, 200]
+    every = np.ones(8, bool)
+    changes = {
+        "mirrored": lambda a: a[:, [1, 0, 2]],
+        "heights_in_feet": lambda a: a / [1, 1, FOOT],
+        "plan_in_feet": lambda a: a * [1, 1, FOOT],
+    }
+    for name, change in changes.items():
+        (right,) = [
+            one for one in alter(change(at), every, "points") if one.name == name
+        ]
+        np.testing.assert_allclose(right.coordinates, at)
+    metres = [
+        one for one in alter(in_degrees(at), every, "points") if one.name == "degrees"
+    ]
+    found = metres[0].coordinates
+    np.testing.assert_allclose(found - found[0], at - at[0], atol=3)
