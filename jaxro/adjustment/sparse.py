@@ -141,6 +141,15 @@ class SparseAdjustment:
         factored, _, carried = system.factorise(_origin(problem), jnp.zeros(()))
         return Cofactors(factored, carried, problem.data.pattern)
 
+    def common_cofactor_of(self, name: str) -> Float[np.ndarray, "_ _"]:
+        """The part of `common_cofactor` that belongs to one family, all members
+        together."""
+        roles = self.problem.roles
+        k = roles.common.index(name)
+        size = self.problem.members[name] * roles.common_sizes[k]
+        own = slice(roles.begin[k], roles.begin[k] + size)
+        return self.common_cofactor[own, own]
+
     def rows(
         self, members: Mapping[str, Sequence[int] | Int[np.ndarray, " _"]]
     ) -> Int[np.ndarray, " row"]:

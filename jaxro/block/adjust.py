@@ -171,7 +171,7 @@ class BlockAdjustment:
             self.inner,
             cameras_of(self.block.focal),
             np.asarray(self.adjustment.parameters["camera"]),
-            self.sigma0**2 * self.adjustment.common_cofactor,
+            self.sigma0**2 * self.adjustment.common_cofactor_of("camera"),
         )
 
     # ---------------------------------------------------------------------------------

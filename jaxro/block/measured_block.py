@@ -1,5 +1,5 @@
-"""What was measured of a strip or block: places of points on photos, each place once,
-and what is known of the ground.
+"""What was measured of a strip or block: places of points on photos, each place once
+however often it comes in, and what is known of the ground.
 
 Photo coordinates are those of `geometry.pairs`: x to the right, y up, origin at the
 principal point, in any unit that the focal length has, too. Everything is NumPy.
@@ -12,10 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
 from ..batches.ragged import Ragged
-
-AGREE = 1e-9
-"""Part of the focal length up to which two places of a point on a photo are one
-measurement."""
+from ..geometry import copies
 
 APART = 0.01
 """Part of the focal length from which on two places of one name on a photo are two
@@ -113,10 +110,10 @@ def from_pairs(
     """The block of oriented pairs: photo names `left` and `right` of each, the names of
     the `points` of all rows.
 
-    A place that several pairs share is one measurement. Two places of a point on one
-    photo that differ are two measurements of it; `TwoPoints` is raised where they are
-    too far apart for that, ValueError where a photo has two focal lengths, and for
-    pairs with covariances: here a place has one standard deviation.
+    A place that several pairs share is one measurement (`without_copies`). Two places
+    of a point on one photo that differ are two measurements of it; `TwoPoints` is
+    raised where they are too far apart for that, ValueError where a photo has two focal
+    lengths, and for pairs with covariances: here a place has one standard deviation.
     """
     if pairs.roots is not None:
         raise ValueError(
@@ -134,21 +131,25 @@ def from_pairs(
     x, y = rows(pairs.x_left, pairs.x_right), rows(pairs.y_left, pairs.y_right)
     sigma, point = rows(pairs.sigma, pairs.sigma), rows(point, point)
     focal = _focals(photos, both, pairs)
-    unit = AGREE * focal[photo]
-    keys = np.stack([photo, point, np.round(x / unit), np.round(y / unit)])
-    _, first = np.unique(keys, axis=1, return_index=True)
-    first.sort()
-    return check_names(
-        MeasuredBlock(
-            photos=tuple(str(name) for name in photos),
-            points=tuple(str(name) for name in names),
-            photo=photo[first],
-            point=point[first],
-            x=x[first],
-            y=y[first],
-            sigma=sigma[first],
-            focal=focal,
-        )
+    block = MeasuredBlock(
+        photos=tuple(str(name) for name in photos),
+        points=tuple(str(name) for name in names),
+        photo=photo,
+        point=point,
+        x=x,
+        y=y,
+        sigma=sigma,
+        focal=focal,
+    )
+    return check_names(without_copies(block))
+
+
+def without_copies(block: MeasuredBlock) -> MeasuredBlock:
+    """The block with each place once: of places of a point on a photo that differ by a
+    small part of their standard deviation, the first one."""
+    most = copies.distance_of(block.sigma, block.focal[block.photo])
+    return block.without(
+        copies.repeat_places(block.photo, block.point, block.x, block.y, most)
     )
 
 
@@ -187,8 +188,8 @@ def add_rays(
     sigma: Float[ArrayLike, " ray"],
 ) -> MeasuredBlock:
     """The block with further rays, such as known points that one photo shows; points
-    may be new. Raises ValueError for a photo that the block has not got, and
-    `TwoPoints`."""
+    may be new, and places that the block has already are no new ones. Raises ValueError
+    for a photo that the block has not got, and `TwoPoints`."""
     of_photo = {name: k for k, name in enumerate(block.photos)}
     of_point = {name: k for k, name in enumerate(block.points)}
     for name in photos:
@@ -197,16 +198,15 @@ def add_rays(
     for name in points:
         of_point.setdefault(name, len(of_point))
     at = np.asarray(places, float)
-    return check_names(
-        block._replace(
-            points=tuple(of_point),
-            photo=np.append(block.photo, [of_photo[name] for name in photos]),
-            point=np.append(block.point, [of_point[name] for name in points]),
-            x=np.append(block.x, at[:, 0]),
-            y=np.append(block.y, at[:, 1]),
-            sigma=np.append(block.sigma, np.asarray(sigma, float)),
-        )
+    more = block._replace(
+        points=tuple(of_point),
+        photo=np.append(block.photo, [of_photo[name] for name in photos]),
+        point=np.append(block.point, [of_point[name] for name in points]),
+        x=np.append(block.x, at[:, 0]),
+        y=np.append(block.y, at[:, 1]),
+        sigma=np.append(block.sigma, np.asarray(sigma, float)),
     )
+    return check_names(without_copies(more))
 
 
 def _focals(photos, both: Int[np.ndarray, "2 pair"], pairs: Ragged):

@@ -29,10 +29,8 @@ def run(options: Options) -> bool:
     inputs = whole.Inputs(*options.read)
     written, why = [], ""
     documents = options.measured.documents
-    with (
-        whole.claim(out, whole.check_target, options.measured.force),
-        documents.claimed(),
-    ):
+    place, force = (out, whole.check_target), options.measured.force
+    with documents.claimed(place, force=force, read=options.read):
         task, made = prepare(options)
         for warning in task.warnings:
             errors.print(f"Warning: {warning}", style="yellow", markup=False)

@@ -3,10 +3,9 @@ cameras of the photos."""
 
 from ..batches.ragged import Ragged
 from ..reports.terminal import say_what
-from ..tables import csv as csv_tables, whole
 from ..tables.cameras import Cameras
 from ..tables.fields import TableError
-from ..tables.measured import Table, to_list, to_ragged
+from ..tables.measured import Table, to_ragged
 from . import other_programs, request, sigma as deviation
 
 
@@ -15,30 +14,9 @@ def read_pairs(options: request.Options) -> tuple[request.Options, Table, Camera
     place, and the cameras. Raises TableError."""
     if other_programs.is_asked(options):
         return other_programs.read_for_block(options)
-    table = _read(options).with_one_sigma()
+    with say_what(f"Reading {options.file} ..."):
+        table = request.read_table(options).with_one_sigma()
     return options, table, _cameras(options, table)
-
-
-def _read(options: request.Options) -> Table:
-    """The pairs. Raises TableError."""
-    file = options.file
-    assert file is not None
-    with say_what(f"Reading {file} ..."):
-        if not whole.is_parquet(file):
-            return csv_tables.read(file)
-        from ..tables import parquet
-
-        source = parquet.Source(file)
-        table = source.read(source.scan().begins)
-    twice = parquet.repeat_points(table)
-    if len(twice):
-        raise TableError(
-            file,
-            column="point",
-            found=f"a point a second time in pair {to_list(table.names)[twice[0]]!r}",
-            expected="each point once in a pair; rename it or delete one of the two",
-        )
-    return table
 
 
 def _cameras(options: request.Options, table: Table) -> Cameras:

@@ -279,7 +279,14 @@ def _with_rays(task: Task, options: Options, table: Table, cameras: Cameras) -> 
         raise TableError(
             options.rays, found=str(error), expected="each name for one point"
         ) from None
-    return replace(task, more=more)
+    warnings = task.warnings
+    if again := len(block.photo) + len(rows) - len(more.photo):
+        warnings += (
+            f"{options.rays}: {again} of {len(rows)} places stand in {table.file} or in "
+            "an earlier line already: the same place is one measurement, and counts "
+            "once.",
+        )
+    return replace(task, more=more, warnings=warnings)
 
 
 def _twice(error: TwoPoints, task: Task, table: Table, cameras: Cameras) -> TableError:

@@ -64,10 +64,8 @@ def run(options: Options) -> bool:
     TableError, with nothing written."""
     console, errors = consoles()
     inputs, texts, warnings = whole.Inputs(*options.read), {}, []
-    with (
-        whole.claim(options.out, whole.check_target, options.force),
-        options.documents.claimed(),
-    ):
+    out, force = (options.out, whole.check_target), options.force
+    with options.documents.claimed(out, force=force, read=options.read):
         task = prepare(options)
         asked = read_wanted(options, task.named)
         with progress(errors, "Calibrating", len(task.named.images)) as told:

@@ -8,7 +8,7 @@ from ..reports.pair import show_causes
 from ..reports.terminal import consoles, progress, say_what
 from ..tables.examples import mock_pair as example
 from ..tables.fields import TableError
-from . import orient as jobs, promise, sigma
+from . import orient as jobs, other_programs, promise, sigma
 from .documents import show_json
 from .request import Example, Options
 from .tolerances import change, check_sigma, tolerances
@@ -48,6 +48,7 @@ def run(
         written = write(
             lambda: (
                 decisions.texts(verdicts, job.units, heading)
+                | other_programs.cameras_text(options, job.known)
                 | files.texts(results, summary)
             )
         )

@@ -1,7 +1,6 @@
 """Places that `jaxro calibrate` corrects: --correct and --pair, and the tables that
 `jaxro orient` and `jaxro clean` read."""
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +8,7 @@ import numpy as np
 from ..calibration import correct
 from ..reports.calibration_model import Done, Photo, distortion
 from ..reports.files import csv_text
-from ..tables import images as tables
+from ..tables import cameras, images as tables
 from ..tables.fields import TableError
 from ..tables.images import NamedImages
 from ..tables.survey_checks import Row
@@ -172,9 +171,4 @@ def _pairs(pairs: list[tuple[str, str]], places: list[Place]) -> str:
 
 def _cameras(pairs: list[tuple[str, str]], focal: dict[str, float]) -> str:
     """The focal lengths of the photos of all pairs."""
-    names = dict.fromkeys(name for both in pairs for name in both)
-    # a string of JSON is one of TOML
-    quoted = {name: json.dumps(name, ensure_ascii=False) for name in names}
-    return "\n".join(
-        f"[photo.{quoted[name]}]\nfocal = {focal[name]!r}\n" for name in names
-    )
+    return cameras.text_of({name: focal[name] for both in pairs for name in both})

@@ -26,30 +26,32 @@ Pictures = Mapping[str, bytes]
 @dataclass(frozen=True)
 class Documents:
     """What is wanted: `report`: a file .html or .pdf; `plots`: a folder; `json`: a
-    summary on standard output in place of the report there; `force`: what is there may
-    be replaced."""
+    summary on standard output in place of the report there."""
 
     report: Path | None = None
     plots: Path | None = None
     json: bool = False
-    force: bool = False
 
     def __bool__(self) -> bool:
         """Whether files are wanted."""
         return self.report is not None or self.plots is not None
 
     @contextmanager
-    def claimed(self) -> Iterator[None]:
-        """Within the block no other process writes there. Raises TableError where they
-        may not be written or cannot be made."""
+    def claimed(
+        self,
+        *others: tuple[Path | None, whole.Check],
+        force: bool,
+        read: Sequence[Path | None],
+    ) -> Iterator[None]:
+        """Within the block no other process writes there, nor to the `others` that the
+        call writes to; `force`: what is there may be replaced, but nothing that is
+        `read`. Raises TableError where they may not be written or cannot be made."""
         if self.report is not None:
             _check_report(self.report)
         if self.plots is not None:
             _need("--plots", "matplotlib")
-        with (
-            whole.claim(self.report, whole.check_file, self.force),
-            whole.claim(self.plots, whole.check_target, self.force),
-        ):
+        own = (self.report, whole.check_file), (self.plots, whole.check_target)
+        with whole.claim_all([*others, *own], force, read):
             yield
 
     def write(

@@ -44,10 +44,8 @@ def run(options: Options) -> bool:
     console, errors = consoles()
     title = "the simulated plot" if options.file is None else str(options.file)
     inputs, texts, why = whole.Inputs(*options.read), {}, ""
-    with (
-        whole.claim(options.out, whole.check_target, options.force),
-        options.documents.claimed(),
-    ):
+    out, force = (options.out, whole.check_target), options.force
+    with options.documents.claimed(out, force=force, read=options.read):
         done = calculate(prepare(options))
         if options.out is not None:
             picture, why = drawn(done, title)

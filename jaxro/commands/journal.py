@@ -3,7 +3,7 @@
     DIR.unfinished/       while the work goes on; no DIR until all of it is there
         journal.jsonl     what was asked for, then one line for each finished part
         elements/part-00000.parquet, residuals/..., points/...
-    DIR/                  the same folder, renamed at the end
+    DIR/                  the same folder, renamed at the end; last its journal goes
 
 The files of a part are complete and on the disk before its line in the journal is, so
 that a run that was stopped at any moment goes on with the first part that has no line,
@@ -15,10 +15,9 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +28,21 @@ from .stream import CONVERTED, Part, Work, Worker, file_digest, part_file
 
 JOURNAL = "journal.jsonl"
 
-MODIFIED = "modified_ns"
-"""When the files that were read were written: part of a request, by which another one
+BYTES = "bytes"
+"""The size of the table that is read."""
+
+DIGESTS = "sha256"
+"""The SHA-256 of the files that are read: part of a request, by which another content
 is known, not of a summary."""
 
 CONVERSION = "converted_sha256"
-"""The SHA-256 of the Parquet table that a CSV table was converted into: likewise."""
+"""The SHA-256 of the Parquet table that another file was converted into: likewise."""
+
+SUMMARY = "summary.json"
+
+DRAFTS = tuple(map(whole.draft_name, (JOURNAL, CONVERTED, SUMMARY)))
+"""What a run that was stopped may have begun to write in its folder; the drafts of parts
+are in folders of their tables."""
 
 
 class Job:
@@ -73,6 +81,15 @@ class Job:
         """Whether there is a journal that says what was asked for."""
         return _has_lines(self.work.folder / JOURNAL)
 
+    def move(self, folder: Path) -> None:
+        """The folder takes another name, and the place of a run that was stopped
+        there."""
+        work = self.work
+        whole.swap(work.folder, folder)
+        converted = CONVERSION in self.request
+        source = folder / work.source.name if converted else work.source
+        self.work = replace(work, folder=folder, source=source)
+
     def begin(self) -> None:
         """A new journal. Raises TableError where the folder cannot be written."""
         with whole.telling(self.work.folder, "a folder that can be written"):
@@ -85,11 +102,11 @@ class Job:
         path = self.work.folder / JOURNAL
         before, *entries = _read(path)
         for key in sorted(set(before) | set(self.request)):
-            if before.get(key) != self.request.get(key):
-                found = (
-                    f"{key} = {before.get(key)!r} in the run to be resumed, "
-                    f"{self.request.get(key)!r} now"
-                )
+            one, other = before.get(key), self.request.get(key)
+            if one != other:
+                found = f"{key} = {one!r} in the run to be resumed, {other!r} now"
+                if key in (BYTES, DIGESTS):
+                    found = "another content of the files that are read than now"
                 raise TableError(
                     path,
                     line=1,
@@ -109,14 +126,15 @@ class Job:
 
     def end(self) -> dict[str, Any]:
         """The summary, when every part is finished; the folder takes its name. Raises
-        TableError where the input is not any more what it was."""
+        TableError where the input or a part is not any more what it was."""
         self._inputs.check()
+        self._verify()
         told = self._totals()
-        own = MODIFIED, CONVERSION
+        own = DIGESTS, CONVERSION
         asked = {key: value for key, value in self.request.items() if key not in own}
         sigma0 = self.work.units.sigma0 or None
         units = asdict(self.work.units) | {"sigma0": sigma0, "angles": "deg"}
-        with whole.draft_of(self.work.folder / "summary.json") as draft:
+        with whole.draft_of(self.work.folder / SUMMARY) as draft:
             draft.write_text(
                 json_text({**asked, **told, "units": units}), encoding="utf-8"
             )
@@ -138,19 +156,22 @@ class Job:
         doubles = [name for entry in self.entries for name in entry["doubles"]]
         return told | {"pairs_with_two_points_of_one_name": doubles}
 
+    def _verify(self) -> None:
+        """Raises TableError for a part that the disk has not kept."""
+        for entry in self.entries:
+            if not self._stands(entry):
+                raise TableError(
+                    self.work.folder,
+                    found=f"part {entry['part']} with another content than was written",
+                    expected="a disk that keeps it; --resume makes the part anew",
+                )
+
     def _rename(self) -> None:
         """The folder takes its name, and the place of one of that name."""
         folder, target = self.work.folder, self.target
         for stray in (*folder.rglob("*.partial"), folder / CONVERTED):
             stray.unlink(missing_ok=True)
-        if target.exists():
-            os.replace(target, target.with_name(f".{target.name}.{os.getpid()}.old"))
-        os.replace(folder, target)
-        # what was replaced by this run, or by one that was killed
-        replaced = re.compile(rf"\.{re.escape(target.name)}\.\d+\.old")
-        for old in list(target.parent.iterdir()):
-            if replaced.fullmatch(old.name):
-                shutil.rmtree(old)
+        whole.swap(folder, target)
         # last: a run that is stopped before can still be resumed
         (target / JOURNAL).unlink()
 

@@ -2,7 +2,6 @@
 the end of the work."""
 
 import os
-import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +25,17 @@ from ..tables.conversion import convert
 from ..tables.fields import TableError
 from ..tables.measured import to_ragged
 from . import other_programs, sigma as deviation
-from .journal import CONVERSION, JOURNAL, MODIFIED, Job, here, previous_request
+from .journal import (
+    BYTES,
+    CONVERSION,
+    DIGESTS,
+    DRAFTS,
+    JOURNAL,
+    SUMMARY,
+    Job,
+    here,
+    previous_request,
+)
 from .request import (
     MEASURED,
     SYSTEMS,
@@ -39,17 +48,13 @@ from .solve import Task, is_good
 from .stream import CONVERTED, PART_ROWS, Work, file_digest, parts
 from .tolerances import check_sigma, tolerances
 
-REPLACED = (*TABLES, "cleaned", "summary.json", JOURNAL)
+REPLACED = (*TABLES, "cleaned", SUMMARY, JOURNAL, whole.REPLACED)
 """What may be in a folder whose place the results take."""
 
 PLACES = 8
 """Runs of pairs, from the begin to the end of a table, that tell its noise."""
 
-WORKED_ON = (
-    *REPLACED,
-    CONVERTED,
-    *(str(Path(name).with_suffix(".partial")) for name in (JOURNAL, CONVERTED)),
-)
+WORKED_ON = (*REPLACED, CONVERTED, *DRAFTS)
 """What may be in the folder of a run that was stopped."""
 
 
@@ -85,12 +90,6 @@ def run(
 
 def _check_whole(options: Options) -> None:
     """Raises TableError for what is made of a whole table at once."""
-    if other_programs.is_asked(options):
-        raise TableError(
-            str(options.file),
-            found="a file of another program, and Parquet results",
-            expected="it without --parquet, or a table",
-        )
     documents = options.documents
     for name, asked in (
         ("--report", documents.report is not None),
@@ -102,8 +101,9 @@ def _check_whole(options: Options) -> None:
             raise TableError(
                 name,
                 found="it with Parquet results",
-                expected="a CSV table without --parquet, whose pairs are looked at "
-                "together; DIR/elements holds the results of any number",
+                expected="it without --parquet, --resume, --tables and --engine: all "
+                "pairs are looked at together then; DIR/elements holds the results of "
+                "any number",
             )
 
 
@@ -157,27 +157,23 @@ def prepare(
     chosen = _tables(large.tables)
     out = options.out.resolve()
     folder = out.with_name(f"{out.name}.unfinished")
+    whole.settle(folder)
     if large.resume and not folder.exists() and (out / JOURNAL).exists():
         os.replace(out, folder)  # stopped when only its journal was left to be removed
     _check(options, out, folder, large.resume)
-    stopped = None
-    if folder.exists() and not large.resume:
-        # kept until the table and all options are known to be good
-        stopped = folder.with_name(f".{folder.name}.{os.getpid()}.old")
-        os.replace(folder, stopped)
+    # a run that was stopped stays until the table and all options are known to be good
+    place = folder if large.resume else whole.hidden(folder)
     try:
-        job = _plan(options, large, procedure, chosen, folder)
+        job = _plan(options, large, procedure, chosen, place)
         job.go_on() if large.resume and job.has_journal else job.begin()
+        if not large.resume:
+            job.move(folder)
     except BaseException as error:
         if not large.resume:
-            shutil.rmtree(folder, ignore_errors=True)
-        if stopped is not None:
-            os.replace(stopped, folder)
+            whole.settle(folder)
         if isinstance(error, parquet.DAMAGED):
             raise _refusal(options.file, folder, error) from None
         raise
-    if stopped is not None:
-        shutil.rmtree(stopped)
     return job
 
 
@@ -209,31 +205,39 @@ def _plan(
     chosen: tuple[str, ...],
     folder: Path,
 ) -> Job:
-    """The job that is asked for; a CSV table is converted first."""
-    assert options.file is not None and options.out is not None
-    inputs = whole.Inputs(options.file, options.camera)
-    source, digest = options.file, None
+    """The job that is asked for; what is no Parquet table is converted first."""
+    file, out = options.file, options.out
+    assert file is not None and out is not None
+    inputs = whole.Inputs(file, options.camera)
+    source, digest, of_others, known = file, None, None, None
+    if other_programs.is_asked(options):
+        options, of_others, known = other_programs.read(options)
     if not whole.is_parquet(source):
         source = folder / CONVERTED
         before = previous_request(folder).get(CONVERSION) if large.resume else None
         digest = file_digest(source) if before and source.exists() else None
         if digest is None or digest != before:
             folder.mkdir(parents=True, exist_ok=True)
-            convert(options.file, source)
+            if of_others is None:
+                convert(file, source)
+            else:
+                with whole.draft_of(source) as draft:
+                    parquet.write(parquet.to_arrow(of_others), draft)
             digest = file_digest(source)
-    table = parquet.Source(source, options.file)
+    relative = of_others is not None
+    table = parquet.Source(source, file, relative)
     system = SYSTEMS[options.elements or "relative"]
-    check_numbers(options, table.has_sigma, str(options.file), system)
-    known = table.has_sigma or options.sigma is not None
+    check_numbers(options, table.has_sigma, str(file), system)
+    sigma_known = table.has_sigma or options.sigma is not None
     if procedure is not None:
-        check_sigma(*procedure, known)
+        check_sigma(*procedure, sigma_known)
     scan = table.scan()
-    cameras = read_cameras(options, MEASURED)
+    cameras = known or read_cameras(options, MEASURED)
     cameras.of_all(
         scan.names,
         str(table.path),
         photos=scan.photos,
-        one_sigma=known and not table.has_covariances,
+        one_sigma=sigma_known and not table.has_covariances,
         place=lambda number: table.place(int(scan.begins[number])),
     )
     noise = None
@@ -248,7 +252,7 @@ def _plan(
     task = Task(
         system=system,
         tables=tuple(name for name in TABLES if name in wanted),
-        sigma_known=known,
+        sigma_known=sigma_known,
         base=options.base,
         residual=options.residual,
         procedure=procedure[1] if procedure else None,
@@ -257,18 +261,19 @@ def _plan(
     single = len(scan.names) == 1
     work = Work(
         source=source.absolute(),
-        file=options.file,
+        file=file,
         folder=folder,
         plan=None if single else plan_for(scan.lengths, len(pieces)),
         cameras=cameras,
         sigma=sigma,
         task=task,
         units=units_of(options, table.has_sigma, system),
+        relative=relative,
     )
     asked |= deviation.entry(noise)
     if digest is not None:
         asked[CONVERSION] = digest
-    return Job(work, pieces, options.out.resolve(), asked, inputs)
+    return Job(work, pieces, out.resolve(), asked, inputs)
 
 
 def _sample(table: parquet.Source, scan: parquet.Scan, cameras: Cameras) -> Ragged:
@@ -339,10 +344,10 @@ def _request(
         "program": f"jaxro {__version__}",
         "file": str(options.file),
     }
-    read = [file for file in (options.file, options.camera) if file is not None]
+    table, cameras = _files(options.file), _files(options.camera)
     asked |= {
-        "bytes": options.file.stat().st_size,
-        MODIFIED: [file.stat().st_mtime_ns for file in read],
+        BYTES: sum(file.stat().st_size for file in table),
+        DIGESTS: [file_digest(file) for file in (*table, *cameras)],
     }
     asked["tables"] = list(tables)
     named = {
@@ -361,6 +366,13 @@ def _request(
     if procedure is not None:
         asked |= {"procedure": procedure[0], "tolerances": tolerances(procedure[1])}
     return asked
+
+
+def _files(path: Path | None) -> list[Path]:
+    """A file that is read, or those of a folder."""
+    if path is None or not path.is_dir():
+        return [] if path is None else [path]
+    return sorted(file for file in path.iterdir() if file.is_file())
 
 
 def _plain(value: Any) -> Any:

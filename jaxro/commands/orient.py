@@ -35,6 +35,7 @@ from .request import (
     Options,
     check_numbers,
     read_cameras,
+    read_table,
     units_of,
 )
 from .solve import Found, Task, Told, make_results, make_verdicts, solve
@@ -116,7 +117,7 @@ def prepare(
     pairs = to_ragged(table, cameras, sigma)
     return Job(
         options=replace(options, sigma=sigma),
-        table=tell_copies(table, pairs),
+        table=tell_copies(table.with_sigma(sigma), pairs),
         cameras=cameras,
         pairs=pairs,
         task=task,
@@ -135,7 +136,7 @@ def _read(options: Options, otherwise: Example) -> tuple[Options, Table, Cameras
     with say_what(f"Reading {options.file} ..."):
         if other_programs.is_asked(options):
             return other_programs.read(options)
-        table = tables.read(options.file)
+        table = read_table(options)
     return options, table, read_cameras(options, otherwise)
 
 
@@ -263,11 +264,8 @@ def writing(options: Options) -> Iterator[Callable[[Texts], str]]:
         whole.write(options.out, made, options.read)
         return f"Written to {options.out}: {', '.join(made)}\n"
 
-    with (
-        whole.claim(options.out, whole.check_target, options.force),
-        whole.claim(options.g2o, whole.check_file, options.force),
-        options.documents.claimed(),
-    ):
+    others = (options.out, whole.check_target), (options.g2o, whole.check_file)
+    with options.documents.claimed(*others, force=options.force, read=options.read):
         yield write
 
 
@@ -293,7 +291,7 @@ def prepare_pose_graph(job: Job) -> Callable[[], str]:
         job.task.sigma_known,
         residual=job.task.keywords["residual"],
     )
-    return lambda: write_graph(file, text, told, options.read)
+    return lambda: write_graph(file, text, told)
 
 
 def write_documents(job: Job, results: Results, cleaned: Cleaned | None = None) -> str:

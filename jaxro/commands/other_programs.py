@@ -4,7 +4,7 @@ block` take what `exchange.files` reads."""
 from dataclasses import replace
 
 from ..exchange import files
-from ..tables.cameras import Cameras
+from ..tables.cameras import Cameras, text_of
 from ..tables.fields import TableError
 from ..tables.measured import Table
 from .request import Options
@@ -44,3 +44,12 @@ def read_for_block(options: Options) -> tuple[Options, Table, Cameras]:
     each point, with a warning."""
     options, table, cameras = read(options)
     return options, table.with_one_sigma(), cameras
+
+
+def cameras_text(options: Options, cameras: Cameras) -> dict[str, str]:
+    """cameras.toml by its name, with which `jaxro orient` reads again what was cleaned;
+    nothing where the user has the cameras of a table."""
+    if not is_asked(options):
+        return {}
+    focals = {name: camera.focal for name, camera in cameras.photos.items()}
+    return {"cameras.toml": text_of(focals)}

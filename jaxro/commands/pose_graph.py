@@ -62,17 +62,8 @@ def graph_text(
     return g2o_text(graph), told
 
 
-def write_graph(
-    path: Path, text: str, told: str, read: tuple[Path | None, ...] = ()
-) -> str:
-    """Write the file; where it is, as a line. Raises TableError where the disk refuses,
-    or the file is one that was `read`."""
-    for file in read:
-        if file is not None and file.resolve() == path.resolve():
-            raise TableError(
-                file,
-                found="a table to be read where the pose graph is to be written",
-                expected="another --g2o",
-            )
+def write_graph(path: Path, text: str, told: str) -> str:
+    """Write the file; where it is, as a line. Raises TableError where the disk
+    refuses."""
     whole.write_file(path, text.encode())
     return f"Pose graph written to {path}: {told}\n"

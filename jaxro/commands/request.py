@@ -14,9 +14,10 @@ from ..geometry.elements import (
 )
 from ..geometry.pairs import Camera
 from ..reports.columns import Units
-from ..tables import cameras as camera_files
+from ..tables import cameras as camera_files, csv as csv_tables, whole
 from ..tables.examples import pair as example
 from ..tables.fields import TableError
+from ..tables.measured import Table
 from . import sigma as deviation
 from .documents import NO_DOCUMENTS, Documents
 
@@ -64,6 +65,16 @@ class Example(NamedTuple):
 
 
 MEASURED = Example(example.NAME, example.FOCAL, example.TABLE)
+
+
+def read_table(options: Options) -> Table:
+    """All pairs of a table together, CSV or Parquet. Raises TableError."""
+    assert options.file is not None
+    if not whole.is_parquet(options.file):
+        return csv_tables.read(options.file)
+    from ..tables import parquet
+
+    return parquet.read_whole(options.file)
 
 
 def units_of(

@@ -90,10 +90,8 @@ def run_comparison(options: Options, wanted: Wanted) -> bool:
     check_picture(wanted.plot)
     console, warnings = consoles()
     inputs = whole.Inputs(*options.read)
-    with (
-        whole.claim(wanted.out, whole.check_file, wanted.force),
-        whole.claim(wanted.plot, whole.check_file, wanted.force),
-    ):
+    targets = [(file, whole.check_file) for file in (wanted.out, wanted.plot)]
+    with whole.claim_all(targets, wanted.force, options.read):
         layouts = layouts_of(options, warnings)
         _check_errors(errors, layouts)
         with progress(warnings, "Comparing", None) as told:

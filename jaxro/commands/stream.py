@@ -41,7 +41,8 @@ class Part(NamedTuple):
 class Work:
     """Everything that one part needs: the same on this machine or another. Reads
     `source`, writes below `folder`; `file` is the table by the name that the user
-    gave. `plan` is None where the table has one pair only."""
+    gave, and `relative` whether its standard deviations are. `plan` is None where the
+    table has one pair only."""
 
     source: Path
     file: Path
@@ -51,6 +52,7 @@ class Work:
     sigma: float | None
     task: Task
     units: Units
+    relative: bool = False
 
 
 class Worker:
@@ -58,14 +60,15 @@ class Worker:
 
     def __init__(self, work: Work, threads: int | None = None):
         self._work, self._threads = work, threads
-        self._source = parquet.Source(work.source, work.file)
+        relative = work.relative
+        self._source = parquet.Source(work.source, work.file, relative=relative)
 
     def __call__(
         self, part: Part, told: Callable[[int], None] = lambda done: None
     ) -> dict[str, Any]:
         """The part read, worked on and written; its line for the journal."""
         work = self._work
-        table = self._source.read(part.begins)
+        table = self._source.read(part.begins).with_sigma(work.sigma)
         cameras = work.cameras.of_all(table.names, table.file, photos=table.photos)
         pairs = to_ragged(table, cameras, work.sigma)
         found = solve(pairs, work.task, work.plan, self._threads, told)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..batches.copies import without_copies
 from ..batches.ragged import Ragged
+from ..geometry import copies
 from ..geometry.cofactor_roots import CofactorRoots, from_covariances
 from ..geometry.pairs import Camera
 from ..tables.cameras import Cameras
@@ -223,13 +224,16 @@ class Tracks(NamedTuple):
 
     def once(self) -> tuple["Tracks", int]:
         """Without the points on photos that show them at two places, and how many they
-        are: nothing tells which place is right."""
-        key = np.stack([self.photo, self.point])
+        are: nothing tells which place is right. The same place, twice, is one."""
+        places = self.photo, self.point, self.seen.x, self.seen.y
+        most = copies.distance_of(np.ones(len(self.photo)), self.focals[self.photo])
+        each = self.choose(~copies.repeat_places(*places, most))
+        key = np.stack([each.photo, each.point])
         _, inverse, counts = np.unique(
             key, axis=1, return_inverse=True, return_counts=True
         )
         twice = counts[inverse.ravel()] > 1
-        return self.choose(~twice), int(np.sum(counts > 1))
+        return each.choose(~twice), int(np.sum(counts > 1))
 
     def choose(self, rows: Bool[np.ndarray, " row"]) -> "Tracks":
         """Some of the rows."""

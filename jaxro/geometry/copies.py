@@ -1,5 +1,6 @@
 """Measurements that repeat another one: the same place of both photos, entered twice,
-or found twice by a detector.
+or found twice by a detector; and the same place of one photo, which several pairs and
+tables have.
 
 A copy is no measurement of its own. It has the error of the first one, so that two
 copies of a wrong point agree with each other and are no evidence. What enters as a
@@ -103,3 +104,26 @@ def rows_with_near_keys(
 def repeated(places: Int[Any, "*pairs point"]) -> Bool[Any, "*pairs point"]:
     """The points that repeat another one, from what `find_copies` tells."""
     return places != np.broadcast_to(np.arange(places.shape[-1]), places.shape)
+
+
+def repeat_places(
+    photo: Int[np.ndarray, " ray"],
+    point: Int[np.ndarray, " ray"],
+    x: Float[np.ndarray, " ray"],
+    y: Float[np.ndarray, " ray"],
+    most: Float[np.ndarray, " ray"],
+) -> Bool[np.ndarray, " ray"]:
+    """Places of points on photos that repeat an earlier one of the same point and photo:
+    neither coordinate differs by more than `most` (`distance_of`) of the earlier
+    one."""
+    repeats = np.ones(len(photo), bool)
+    left = np.lexsort((point, photo))  # in each group earlier ones first
+    while len(left):
+        of_photo, of_point = photo[left], point[left]
+        begins = np.ones(len(left), bool)
+        begins[1:] = (np.diff(of_photo) != 0) | (np.diff(of_point) != 0)
+        repeats[left[begins]] = False
+        first = left[begins][np.cumsum(begins) - 1]
+        apart = np.maximum(abs(x[left] - x[first]), abs(y[left] - y[first]))
+        left = left[~(begins | (apart <= most[first]))]
+    return repeats

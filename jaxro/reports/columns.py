@@ -20,7 +20,7 @@ from ..assessment.reliability import CONTROL
 from ..geometry.elements import AbstractElements, DependentElements, RelativePose
 from ..orientation.results import RESULTS
 from ..rejection import OUTCOMES
-from ..tables.measured import COORDINATES, NUMBERS
+from ..tables.measured import COORDINATES, NUMBERS, PHOTOS, VERDICTS
 
 
 def _names_and_sentences(kind: Any) -> tuple[dict[int, str], dict[str, str]]:
@@ -267,9 +267,10 @@ RELIABILITY = (
 
 CLEANED = (
     PAIR,
+    *(Column(name) for name in PHOTOS),
     POINT,
     *(Column(name) for name in NUMBERS),
-    Column("verdict", names={0: "rejected", 1: "kept", 2: "undecided"}, only="csv"),
+    Column("verdict", names=VERDICTS, only="csv"),
     Column("kept", only="parquet"),
     Column("undecided", only="parquet"),
     Column("order"),

@@ -90,9 +90,11 @@ def draw_tests(one: One) -> Any:
 
 def draw_leave_one_out(one: One, verdicts: Verdicts | None = None) -> Any:
     """How the mean y-parallax falls without each of the measured points; None for pairs
-    of many or too few points, or without an orientation."""
+    of many or too few points, with covariances, which this test has no place for, or
+    without an orientation."""
     names, pair, out = measured(one, verdicts)
-    if not one.usable or not 6 < len(names) <= OMITTED:
+    testable = 6 < len(names) <= OMITTED and pair.roots is None
+    if not one.usable or not testable:
         return None
     mask = np.asarray(pair.mask) | out
     found = LeaveOneOutGrubbs(exact=False)(

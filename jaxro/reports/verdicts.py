@@ -172,6 +172,7 @@ class Verdicts:
         order = np.where(kept, -1, found["order"]).astype(np.int32)
         values = {
             "pair": take(table.names, table.owners),
+            **table.photos_of_rows,
             "point": table.points,
             "verdict": np.where(kept & found["undecided"], 2, kept.astype(int)),
         }
@@ -181,16 +182,17 @@ class Verdicts:
 def texts(verdicts: Verdicts, units: Units, summary: dict[str, Any]) -> dict[str, str]:
     """The content of the three files by name."""
     columns, values = verdicts.written()
-    assert verdicts.table.lines is not None and verdicts.rounds is not None
-    by_line = np.argsort(verdicts.table.lines)
-    ordered = {name: take(column, by_line) for name, column in values.items()}
     table, rounds = verdicts.table, verdicts.rounds
+    assert rounds is not None
+    if table.lines is not None:  # as in the input, where pairs may alternate
+        by_line = np.argsort(table.lines)
+        values = {name: take(column, by_line) for name, column in values.items()}
     named = {
         "pair": table.names[table.owners[rounds.rows]],
         "point": table.points[rounds.rows],
     }
     return {
-        "cleaned.csv": table_text(columns, ordered, units),
+        "cleaned.csv": table_text(columns, values, units),
         "decisions.csv": table_text(ROUNDS, rounds.columns | named, units),
         "decisions.json": json_text(summary_of(verdicts, summary)),
     }

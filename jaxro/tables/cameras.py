@@ -8,10 +8,11 @@ Each table holds focal and, where they are not the defaults, principal_point = [
 pixel_size = 1, y_down = false.
 """
 
+import json
 import re
 import sys
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -290,6 +291,18 @@ def _line(text: str, table: str, key: str | None = None) -> int | None:
         ):
             return number
     return None
+
+
+def text_of(focal: Mapping[str, float]) -> str:
+    """The TOML text of photos with these focal lengths, for coordinates from the
+    principal point."""
+    # a string of JSON is one of TOML, but for one letter
+    quoted = lambda name: json.dumps(name, ensure_ascii=False).replace(
+        "\x7f", "\\u007f"
+    )
+    return "\n".join(
+        f"[photo.{quoted(name)}]\nfocal = {value!r}\n" for name, value in focal.items()
+    )
 
 
 def check_one_sigma(

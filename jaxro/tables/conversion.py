@@ -14,7 +14,14 @@ import pyarrow.csv as arrow_csv
 
 from . import csv as tables, whole
 from .fields import find_separator
-from .measured import COLUMNS, COVARIANCES, DEVIATIONS, PHOTOS, check_accuracy
+from .measured import (
+    COLUMNS,
+    COVARIANCES,
+    DEVIATIONS,
+    OF_CLEANING,
+    PHOTOS,
+    check_accuracy,
+)
 from .parquet import BATCH, NAMES, encoding, pa, pc, pq
 
 
@@ -46,7 +53,7 @@ def _convert_quickly(source: Path, draft: Path, point: str) -> None:
     COLUMNS.places(header, str(source), line)
     check_accuracy([COLUMNS.full(name) for name in header], str(source))
     full = [COLUMNS.full(name) for name in header]
-    if set(PHOTOS) & set(full):
+    if set(PHOTOS) & set(full) or OF_CLEANING[0] in full:
         raise pa.ArrowInvalid("for the careful reader")
     types = {c: pa.string() if c in NAMES else pa.float64() for c in full}
     reader = arrow_csv.open_csv(
@@ -77,9 +84,10 @@ def _convert_quickly(source: Path, draft: Path, point: str) -> None:
 
 def _convert_carefully(source: Path, draft: Path) -> None:
     """Line by line, a tenth as fast. Raises TableError."""
-    lines, writer = tables.lines(source), None
+    lines = (line for line in tables.lines(source) if line.kept)
+    writer = None
     while rows := list(islice(lines, BATCH)):
-        _, pairs, points, values, photos, names = zip(*rows, strict=True)
+        _, pairs, points, values, photos, names, _ = zip(*rows, strict=True)
         columns = {"pair": pairs} if pairs[0] else {}
         if photos[0]:
             columns |= dict(zip(PHOTOS, zip(*photos, strict=True), strict=True))

@@ -8,6 +8,9 @@ sigma_x_left, sigma_y_left, sigma_x_right, sigma_y_right, and the covariances of
 in each photo, cov_xy_left and cov_xy_right. All are in the units of the measurement
 (covariances in their square); cameras turn them into photo coordinates. Nothing is
 skipped or guessed: whatever does not fit stops the reading with file, line and column.
+
+The table that `jaxro clean` writes, cleaned.csv, has the column verdict beside these:
+rejected points are left out.
 """
 
 import io
@@ -23,6 +26,7 @@ from .measured import (
     DEVIATIONS,
     NUMBERS,
     PHOTOS,
+    VERDICTS,
     Measurements,
     Table,
     check_accuracy,
@@ -32,8 +36,8 @@ from .measured import (
 
 class Line(NamedTuple):
     """One line of a table: its number, pair, point, the numbers of `NUMBERS` that the
-    table has, the photos of the pair, () where it has none, and the names of the
-    numbers."""
+    table has, the photos of the pair, () where it has none, the names of the numbers,
+    and whether the point was not rejected by an earlier cleaning."""
 
     number: int
     pair: str
@@ -41,6 +45,7 @@ class Line(NamedTuple):
     values: tuple[float, ...]
     photos: tuple[str, ...]
     columns: tuple[str, ...]
+    kept: bool
 
 
 def read(path: Path) -> Table:
@@ -52,14 +57,17 @@ def read(path: Path) -> Table:
 def parse(text: str, file: str, name: str) -> Table:
     """The pairs of CSV text. `file` is named in errors, `name` is the pair's where the
     table has no column `pair`."""
-    line = 1
+    line, rejected = 1, 0
     pairs: dict[str, Measurements] = {}
     seen: dict[str, dict[str, int]] = {}
     places: dict[tuple, str] = {}
     twins: dict[str, list[str]] = {}
-    for line, pair, point, values, photos, columns in check_lines(
+    for line, pair, point, values, photos, columns, kept in check_lines(
         io.StringIO(text, newline=""), file, name
     ):
+        if not kept:
+            rejected += 1
+            continue
         first = seen.setdefault(pair, {}).setdefault(point, line)
         if first != line:
             found = f"{point!r} a second time in pair {pair!r} (first on line {first})"
@@ -91,6 +99,9 @@ def parse(text: str, file: str, name: str) -> Table:
     if not pairs:
         raise no_points(file, line)
     warnings = [_twins(file, pair, found) for pair, found in twins.items()]
+    if rejected:
+        points = "1 point is" if rejected == 1 else f"{rejected} points are"
+        warnings.append(f"{file}: {points} left out, which the column verdict rejects.")
     return of_pairs(list(pairs.values()), file, warnings)
 
 
@@ -125,7 +136,8 @@ def check_lines(text: Iterable[str], file: str, name: str = "") -> Iterator[Line
             pair = fields.name(cells["pair"], file, line, "pair")
         values = tuple(_number(cells[c], file, line, c) for c in columns)
         _check_covariances(dict(zip(columns, values, strict=True)), file, line)
-        yield Line(line, pair, point, values, photos, columns)
+        kept = "verdict" not in cells or _is_kept(cells["verdict"], file, line)
+        yield Line(line, pair, point, values, photos, columns, kept)
 
 
 def _photos(cells: dict[str, str], file: str, line: int) -> tuple[str, ...]:
@@ -151,6 +163,19 @@ def _photos(cells: dict[str, str], file: str, line: int) -> tuple[str, ...]:
             expected="two photos in each pair",
         )
     return left, right
+
+
+def _is_kept(verdict: str, file: str, line: int) -> bool:
+    """Whether an earlier cleaning did not reject the point. Raises TableError."""
+    if verdict not in VERDICTS.values():
+        raise TableError(
+            file,
+            line=line,
+            column="verdict",
+            found=repr(verdict),
+            expected=f"one of {', '.join(VERDICTS.values())}",
+        )
+    return verdict != VERDICTS[0]
 
 
 def _twins(file: str, pair: str, found: list[str]) -> str:

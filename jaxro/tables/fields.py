@@ -74,12 +74,15 @@ class TableError(ValueError):
 @dataclass(frozen=True)
 class Columns:
     """The columns of a kind of table, in any order and any case; `short`: other names
-    of some; `texts`: those that hold names, where the others hold numbers."""
+    of some; `texts`: those that hold names, where the others hold numbers; `results`:
+    columns that jaxro writes beside these, and reads again without a use for them
+    where the first one is there."""
 
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
     short: Mapping[str, str] = field(default_factory=dict)
     texts: tuple[str, ...] = ("pair", "point")
+    results: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         short = f" (or {','.join(self.short)})" if self.short else ""
@@ -89,6 +92,9 @@ class Columns:
     def full(self, given: str) -> str:
         """The name of a column as it is written here."""
         name = given.strip().lower()
+        without_unit = name.partition("_")[0]
+        if without_unit in self.results:
+            return without_unit
         return self.short.get(name, name)
 
     def places(self, header: list[str], file: str, line: int | None) -> dict[str, int]:
@@ -100,10 +106,13 @@ class Columns:
                 found=f"the header {header[0]!r}",
                 expected="fields separated by commas, semicolons or tabs",
             )
+        known = self.required + self.optional
+        if any(self.full(entry) in self.results[:1] for entry in header):
+            known += self.results
         places: dict[str, int] = {}
         for place, entry in enumerate(header):
             given, full = entry.strip().lower(), self.full(entry)
-            if full not in self.required + self.optional:
+            if full not in known:
                 what = (
                     f"an unknown column {entry!r}"
                     if given

@@ -30,6 +30,12 @@ DEVIATIONS = tuple(f"sigma_{name}" for name in COORDINATES)
 COVARIANCES = ("cov_xy_left", "cov_xy_right")
 """Columns with the covariances of x and y of a photo, beside the deviations."""
 
+VERDICTS = {0: "rejected", 1: "kept", 2: "undecided"}
+"""What a procedure may have decided about a point."""
+
+OF_CLEANING = ("verdict", "order", "statistic", "limit", "q")
+"""Columns that say so in a table of cleaned pairs."""
+
 NAMED = 5
 """Points that a warning names."""
 
@@ -38,6 +44,7 @@ COLUMNS = Columns(
     ("pair", *PHOTOS, "sigma", *DEVIATIONS, *COVARIANCES),
     {"id": "point", "xl": "x_left", "yl": "y_left", "xr": "x_right", "yr": "y_right"},
     texts=("pair", "point", *PHOTOS),
+    results=OF_CLEANING,
 )
 NUMBERS = (*COORDINATES, "sigma", *DEVIATIONS, *COVARIANCES)
 
@@ -114,12 +121,21 @@ class Table:
         """The number of the pair of every row."""
         return np.repeat(np.arange(len(self.begins) - 1), self.lengths)
 
+    @property
+    def photos_of_rows(self) -> dict[str, Any]:
+        """The names of both photos of every row, by the names of their columns; nothing
+        where the table does not name photos."""
+        if self.photos is None:
+            return {}
+        columns = (take(of_pairs, self.owners) for of_pairs in self.photos)
+        return dict(zip(PHOTOS, columns, strict=True))
+
     def with_one_sigma(self) -> "Table":
         """The table with one standard deviation for each point, for what cannot use
         more: the root of the mean of its variances. Adds a warning."""
         if not self.has_covariances:
             return self
-        squares = [_floats(self.numbers[name]) ** 2 for name in DEVIATIONS]
+        squares = [to_floats(self.numbers[name]) ** 2 for name in DEVIATIONS]
         sigma = np.sqrt(np.mean(squares, axis=0))
         most = float(np.nanmax(np.sqrt(np.max(squares, axis=0)) / sigma))
         others = {n: c for n, c in self.numbers.items() if n in COORDINATES}
@@ -132,6 +148,21 @@ class Table:
             numbers=others | {"sigma": sigma},
             warnings=(*self.warnings, warning),
         )
+
+    def with_sigma(self, sigma: float | None) -> "Table":
+        """The table with standard deviations in place of relative ones, whose unit is
+        `sigma`; as it is where nothing is relative or the unit is not known."""
+        if sigma is None or not self.relative:
+            return self
+        units = dict.fromkeys(("sigma", *DEVIATIONS), sigma)
+        units |= dict.fromkeys(COVARIANCES, sigma**2)
+        numbers = {
+            name: to_floats(column) * units[name] if name in units else column
+            for name, column in self.numbers.items()
+        }
+        if not self.has_covariances:
+            numbers.setdefault("sigma", np.full(len(self.points), sigma, float))
+        return replace(self, numbers=numbers, relative=False)
 
     def first_line(self, number: int) -> int | None:
         """The line of the first point of a pair, in CSV text."""
@@ -222,8 +253,8 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
         x0 = constant(side, lambda c: c.principal_point[0])
         y0 = constant(side, lambda c: c.principal_point[1])
         photo += [
-            (_floats(table.numbers[u]) - x0) * size,
-            (_floats(table.numbers[v]) - y0) * (sign * size),
+            (to_floats(table.numbers[u]) - x0) * size,
+            (to_floats(table.numbers[v]) - y0) * (sign * size),
         ]
     deviation, roots = np.ones(count), None
     unit = 1.0 if sigma is None or not table.relative else sigma
@@ -236,7 +267,7 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
         deviation = deviation * unit
     elif "sigma" in table.numbers or sigma is not None:
         given = (
-            _floats(table.numbers["sigma"]) * unit
+            to_floats(table.numbers["sigma"]) * unit
             if "sigma" in table.numbers
             else np.full(count, sigma, float)
         )
@@ -294,10 +325,10 @@ def _covariances(
     table: Table, side: int, size: Any, sign: Any
 ) -> Float[np.ndarray, "row 2 2"]:
     """The covariance matrices of (x, y) in the photos of one side, in photo units."""
-    x, y = (_floats(table.numbers[n]) * size for n in DEVIATIONS[2 * side :][:2])
+    x, y = (to_floats(table.numbers[n]) * size for n in DEVIATIONS[2 * side :][:2])
     xy = np.zeros(len(x))
     if COVARIANCES[side] in table.numbers:
-        xy = _floats(table.numbers[COVARIANCES[side]]) * (sign * size**2)
+        xy = to_floats(table.numbers[COVARIANCES[side]]) * (sign * size**2)
     return covariances_of(x, y, xy)
 
 
@@ -328,7 +359,7 @@ def one_pair(pairs: Ragged, number: int) -> Pair:
     return Pair(*jax.device_put([*of_points, *focals, roots]))
 
 
-def _floats(column: Any) -> Float[np.ndarray, " row"]:
+def to_floats(column: Any) -> Float[np.ndarray, " row"]:
     """The numbers of a column of NumPy or Arrow, NaN where one is missing."""
     if not isinstance(column, np.ndarray):
         column = column.cast("float64", safe=False).to_numpy()

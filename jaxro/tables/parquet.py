@@ -6,6 +6,7 @@ be text or whole numbers. A coordinate that is missing or not finite makes its p
 `non_finite_input`, and harms no other.
 """
 
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,17 @@ from jaxtyping import Int
 
 from . import csv as tables
 from .fields import TableError
-from .measured import COLUMNS, DEVIATIONS, NUMBERS, PHOTOS, Table, check_accuracy
+from .measured import (
+    COLUMNS,
+    DEVIATIONS,
+    NUMBERS,
+    PHOTOS,
+    Table,
+    check_accuracy,
+    take,
+    to_floats,
+    to_list,
+)
 
 try:
     import pyarrow as pa
@@ -53,12 +64,14 @@ class Scan(NamedTuple):
 class Source:
     """A Parquet table of measured points. Raises TableError where it is none.
 
-    `told`: the CSV table of which it is made.
+    `told`: the file of which it is made: a CSV table; or one of another program, whose
+    standard deviations are `relative`.
     """
 
-    def __init__(self, path: Path, told: Path | None = None):
+    def __init__(self, path: Path, told: Path | None = None, relative: bool = False):
         self.path, self._own = told or path, path
-        self._converted = self.path != path
+        self._relative = relative
+        self._has_lines = self.path != path and not relative
         try:
             self._file = pq.ParquetFile(path, pre_buffer=False)
         except DAMAGED as error:
@@ -73,7 +86,8 @@ class Source:
     @property
     def has_sigma(self) -> bool:
         """Whether the table tells the standard deviations of the coordinates."""
-        return "sigma" in self.columns or self.has_covariances
+        there = "sigma" in self.columns or self.has_covariances
+        return there and not self._relative
 
     @property
     def has_covariances(self) -> bool:
@@ -178,7 +192,7 @@ class Source:
 
     def place(self, row: int) -> str:
         """How a row is told of: by its line where the table has been converted."""
-        if not self._converted:
+        if not self._has_lines:
             return f"row {row + 1}"
         line, *_ = next(islice(tables.lines(self.path), row, None))
         return f"line {line}"
@@ -202,6 +216,7 @@ class Source:
             points=rows.column("point"),
             numbers={n: rows.column(n) for n in NUMBERS if n in rows.column_names},
             photos=photos,
+            relative=self._relative,
         )
 
     def _once_a_pair(self, column: Any, begins: np.ndarray, name: str) -> Any:
@@ -294,6 +309,30 @@ def _runs(column: Any, last: Any) -> np.ndarray:
     )
 
 
+def read_whole(path: Path) -> Table:
+    """All pairs of a table together, in NumPy as those of CSV text. Raises
+    TableError."""
+    source = Source(path)
+    table = source.read(source.scan().begins)
+    twice = repeat_points(table)
+    if len(twice):
+        raise TableError(
+            path,
+            column="point",
+            found=f"a point a second time in pair {to_list(table.names)[twice[0]]!r}",
+            expected="each point once in a pair; rename it or delete one of the two",
+        )
+    texts = lambda column: np.array([str(name) for name in to_list(column)], object)
+    left, right = map(texts, table.photos or ((), ()))
+    return replace(
+        table,
+        names=texts(table.names),
+        points=texts(table.points),
+        numbers={name: to_floats(column) for name, column in table.numbers.items()},
+        photos=None if table.photos is None else (left, right),
+    )
+
+
 def repeat_points(table: Table) -> np.ndarray:
     """The numbers of the pairs that have two points of one name."""
     begins = table.begins
@@ -306,6 +345,13 @@ def repeat_points(table: Table) -> np.ndarray:
         return np.zeros(0, int)
     key = np.sort(table.owners * (int(codes.max()) + 1) + codes)
     return np.unique(key[1:][np.diff(key) == 0] // (int(codes.max()) + 1))
+
+
+def to_arrow(table: Table) -> Any:
+    """The pairs as an Arrow table that `Source` reads."""
+    pairs = {"pair": take(table.names, table.owners), **table.photos_of_rows}
+    columns = {**pairs, "point": table.points, **table.numbers}
+    return pa.table({name: pa.array(column) for name, column in columns.items()})
 
 
 def write(table: Any, path: Path) -> None:

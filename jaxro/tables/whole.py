@@ -1,15 +1,35 @@
 """Whole files or none: where a result may be written, by one process at a time, and
-writing it there; and whether what was read is still what it was."""
+writing it there; and whether what was read is still what it was.
+
+Everything is written as a draft beside its place first, under a name of its own
+(`draft_name`, `hidden`). A complete folder takes the place of an earlier one in two
+steps, because no system does it in one:
+
+    DIR -> .DIR.123.partial/.replaced       the earlier one into the draft
+    .DIR.123.partial -> DIR                 the draft takes its name
+
+A process that is killed at any moment leaves the earlier folder or the new one, and
+`settle` ends what was begun: a draft that holds an earlier folder is complete.
+"""
 
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from .fields import TableError
+
+REPLACED = ".replaced"
+"""The folder whose place a folder takes, inside of that one until it is removed."""
+
+ENDINGS = (".csv", ".json", ".parquet", ".png", ".toml")
+"""Of the files of results: no other file in their folder has such a name."""
+
+Check = Callable[[Path, bool], None]
+"""Raises TableError unless a result may be written to a path, by force or not."""
 
 
 def is_parquet(file: Path) -> bool:
@@ -44,27 +64,25 @@ def _state(file: Path) -> tuple[int, ...]:
 
 
 @contextmanager
-def claim(
-    target: Path | None, check: Callable[[Path, bool], None], force: bool
-) -> Iterator[None]:
+def claim(target: Path | None, check: Check, force: bool) -> Iterator[None]:
     """Within the block no other process writes to `target`, a folder or a file, nothing
     where it is None.
 
     `check`: one of the functions below, which says whether a result may be written
     there. Raises TableError where it may not, or where another process writes to it.
-    What a process that was killed had not finished is removed.
+    What a process that was killed had not finished is settled.
     """
     if target is None:
         yield
         return
-    check(target, force)
+    check_name(target, "a name for the result")
     path = target.resolve()
     made = _make_parents(path, target)
     try:
         lock = _lock(path, target)
         try:
-            check(target, force)  # what another process may have finished meanwhile
-            _remove_drafts(path)
+            settle(path)
+            check(target, force)
             yield
         finally:
             # as long as it is held: who waits for it then sees that it is gone
@@ -75,6 +93,49 @@ def claim(
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()  # where nothing was written
+
+
+@contextmanager
+def claim_all(
+    targets: Sequence[tuple[Path | None, Check]],
+    force: bool,
+    read: Sequence[Path | None] = (),
+) -> Iterator[None]:
+    """`claim` of all places that a call writes to, each with its check; what lies in a
+    folder among them is claimed with it. Raises TableError where one of them is a file
+    that is `read`, or another one's."""
+    there = [(path, check) for path, check in targets if path is not None]
+    there.sort(key=lambda target: len(target[0].resolve().parts))
+    inputs = {file.resolve(): file for file in read if file is not None}
+    claimed: list[Path] = []
+    with ExitStack() as stack:
+        for target, check in there:
+            path = target.resolve()
+            if path in inputs:
+                raise TableError(
+                    inputs[path],
+                    found="a table to be read where a result is to be written",
+                    expected="another name for the result",
+                )
+            if any(own == path or own in path.parents for own in claimed):
+                if check is check_file:
+                    _check_apart(target, path, claimed)
+                settle(path)
+                check(target, force)
+            else:
+                stack.enter_context(claim(target, check, force))
+                claimed.append(path)
+        yield
+
+
+def _check_apart(target: Path, path: Path, claimed: list[Path]) -> None:
+    """Raises TableError for a file that another result has the name of, or may have."""
+    if path in claimed or (path.parent in claimed and path.suffix.lower() in ENDINGS):
+        raise TableError(
+            target,
+            found="a name that another result of this call may have",
+            expected="another name",
+        )
 
 
 def _lock(path: Path, target: Path) -> Any:
@@ -104,12 +165,43 @@ def _make_parents(path: Path, target: Path) -> list[Path]:
     return missing
 
 
-def _remove_drafts(path: Path) -> None:
-    """Remove what was begun by processes that do not live any more."""
+def settle(path: Path) -> None:
+    """End what was begun at `path` by processes that do not live any more: what was
+    complete takes its place, drafts are removed."""
     draft = re.compile(rf"\.{re.escape(path.name)}\.\d+\.partial(-\w+)?")
-    for entry in list(path.parent.iterdir()):
-        if draft.fullmatch(entry.name):
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
+    entries = list(path.parent.iterdir()) if path.parent.is_dir() else []
+    for entry in entries:
+        if not draft.fullmatch(entry.name):
+            continue
+        if not entry.is_dir():
+            entry.unlink(missing_ok=True)
+        elif not (entry / REPLACED).exists():
+            shutil.rmtree(entry)
+        elif not path.exists():
+            os.replace(entry, path)
+    _remove(path / REPLACED)
+
+
+def swap(draft: Path, path: Path) -> None:
+    """A complete folder takes the name `path`, and the place of the folder there."""
+    there = path.exists()
+    if there:
+        _remove(draft / REPLACED)
+        shutil.copymode(path, draft)
+        os.replace(path, draft / REPLACED)
+    try:
+        os.replace(draft, path)
+    except OSError:
+        if there:
+            os.replace(draft / REPLACED, path)
+        raise
+    _remove(path / REPLACED)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder, if it is there."""
+    if folder.is_dir():
+        shutil.rmtree(folder)
 
 
 def check_target(directory: Path, force: bool) -> None:
@@ -149,7 +241,7 @@ def check_name(path: Path, expected: str) -> None:
     if not whole.name:
         raise TableError(path, found="the root of all folders", expected=expected)
     with telling(path, expected), suppress(FileNotFoundError):
-        whole.with_name(f".{whole.name}.{os.getpid()}.unfinished.old").lstat()
+        hidden(whole.with_name(f"{whole.name}.unfinished")).lstat()
 
 
 @contextmanager
@@ -166,7 +258,7 @@ def telling(path: Path, expected: str) -> Iterator[None]:
 def draft_of(path: Path, draft: Path | None = None) -> Iterator[Path]:
     """A file to write, beside `path` if not given, which takes the place of `path` when
     all of it is on the disk. Of an error nothing is left."""
-    draft = draft or path.with_suffix(".partial")
+    draft = draft or path.with_name(draft_name(path.name))
     draft.unlink(missing_ok=True)
     try:
         yield draft
@@ -182,7 +274,8 @@ def write(
     directory: Path, texts: Mapping[str, str | bytes], read: Sequence[Path | None] = ()
 ) -> None:
     """All files by name, first complete in a folder beside `directory`, then renamed
-    into place.
+    into place: the whole folder where `directory` holds nothing but files of these
+    names, else one file after the other.
 
     Raises TableError, with nothing written, where the disk refuses, or one would take
     the place of a file that was `read`.
@@ -195,33 +288,54 @@ def write(
                 found="a table to be read where a result is to be written",
                 expected="another --out",
             )
-    draft = _hidden(directory)
+    place = directory.resolve()
+    draft = hidden(place)
     try:
         with telling(directory, "a folder that can be written"):
             draft.mkdir(parents=True)
             for name, text in texts.items():
-                content = text if isinstance(text, bytes) else text.encode()
-                (draft / name).write_bytes(content)
-            if directory.exists():
-                for name in texts:
-                    os.replace(draft / name, directory / name)
+                _write_through(draft / name, text)
+            if _may_go(place, texts):
+                swap(draft, place)
             else:
-                os.replace(draft, directory)
+                for name in texts:
+                    os.replace(draft / name, place / name)
     finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        if not (draft / REPLACED).exists():
+            shutil.rmtree(draft, ignore_errors=True)
+
+
+def _may_go(folder: Path, names: Container[str]) -> bool:
+    """Whether another folder with files of these names may take the place of this one:
+    nobody works in it, and nothing else is in it."""
+    if not folder.exists():
+        return True
+    busy = os.path.ismount(folder) or folder in (Path.cwd(), *Path.cwd().parents)
+    return not busy and all(entry.name in names for entry in folder.iterdir())
+
+
+def _write_through(path: Path, content: str | bytes) -> None:
+    """A file, all of which is on the disk."""
+    with path.open("wb") as file:
+        file.write(content if isinstance(content, bytes) else content.encode())
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def write_file(path: Path, content: str | bytes) -> None:
     """The whole file or none. Raises TableError."""
     with telling(path, "a file that can be written"):
         path.absolute().parent.mkdir(parents=True, exist_ok=True)
-        with draft_of(path, _hidden(path)) as draft:
-            draft.write_bytes(
-                content if isinstance(content, bytes) else content.encode()
-            )
+        with draft_of(path, hidden(path)) as draft:
+            _write_through(draft, content)
 
 
-def _hidden(path: Path) -> Path:
+def draft_name(name: str) -> str:
+    """The name of the draft of a file, in the folder of a run."""
+    return Path(name).with_suffix(".partial").name
+
+
+def hidden(path: Path) -> Path:
     """Where the draft of a file or a folder of the user is written."""
     whole = path.absolute()
     return whole.with_name(f".{whole.name}.{os.getpid()}.partial")

@@ -174,6 +174,23 @@ def test_scale_bars_are_those_of_a_dense_update():
     np.testing.assert_allclose(same.bar_redundancy, 1, atol=1e-6)
 
 
+def test_bars_without_weight_leave_the_cameras_what_they_are():
+    """Values and deviations: the ends of the bars are common unknowns beside them."""
+    mock = block.mock_block(7, Flight(models=3))
+    measured, start = mock.block, start_from(mock.block, mock.photos)
+    inner = Inner(principal=False)
+    plain = adjust_block(measured, start, mock.ground, inner).check().cameras
+    given = block.bars(["t7", "t9"], ["t20", "t16"], np.full(2, 1e3), 1e7)
+    found = adjust_block(measured, start, mock.ground, inner, bars=given).check()
+    np.testing.assert_allclose(found.cameras.values, plain.values, rtol=1e-7)
+    # one more degree of freedom for each bar, which fits
+    np.testing.assert_allclose(
+        found.cameras.deviations / found.sigma0,
+        plain.deviations / adjust_block(measured, start, mock.ground, inner).sigma0,
+        rtol=1e-5,
+    )
+
+
 @pytest.mark.slow
 def test_bars_give_a_free_network_its_scale():
     mock = SMALL

@@ -12,7 +12,7 @@ from jaxro.batches.ragged import Ragged, orient_ragged
 from jaxro.block.adjust import adjust_block
 from jaxro.block.adjust_chained import start_from
 from jaxro.block.chain import Chained
-from jaxro.block.measured_block import MeasuredBlock
+from jaxro.block.measured_block import MeasuredBlock, add_rays
 from jaxro.block.orient_block import orient_block
 from jaxro.block.wrong import normalise_residuals
 
@@ -268,6 +268,28 @@ def test_intervals_of_photos_and_points_hold_the_truth(flight):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("moved", "new"), [(0.0, 0), (0.02, 0), (0.5, 1)])
+def test_a_place_is_one_measurement_however_it_comes_in(moved, new):
+    """Shared by pairs, or once more as a ray; `moved` standard deviations, it is one as
+    long as that is a small part."""
+    measured = block.mock_block(3, block.Flight(models=3)).block
+    left, right, pairs, points = block.pairs_of(measured)
+    random = np.random.default_rng(3)
+    shift = lambda a: a + moved * 0.7 * pairs.sigma * random.choice([-1, 1], len(a))
+    pairs = pairs._replace(x_left=shift(pairs.x_left), y_right=shift(pairs.y_right))
+    found = block.from_pairs(left, right, pairs, points)
+    seen = len(set(zip(measured.photo, measured.point, strict=True)))
+    assert (len(found.photo) > seen) == bool(new)
+    at = np.stack([found.x, found.y], axis=1) + moved * found.sigma[:, None]
+    names = (
+        [found.photos[k] for k in found.photo],
+        [found.points[k] for k in found.point],
+    )
+    more = add_rays(found, *names, at, found.sigma)
+    assert (len(more.photo) > len(found.photo)) == bool(new)
+    np.testing.assert_array_equal(more.x[: len(found.x)], found.x)
+
+
 def test_swapped_names_in_a_hundred_blocks():
     """Chained from their pairs, without wrong ties."""
     hits = 0

@@ -163,6 +163,23 @@ def test_a_control_point_on_one_photo_counts(tables, written, tmp_path):
     assert found["points"] == plain["points"] + 1
 
 
+def test_rays_that_stand_in_the_pairs_count_once(tables, written, tmp_path):
+    """They are the same measurements, read a second time; it is told."""
+    plain = json.loads((written / "summary.json").read_text())
+    both = [
+        f"{row[side]},{row['point']},{row[f'x_{side}'][:12]},{row[f'y_{side}'][:12]}"
+        for row in rows(tables[0])
+        for side in ("left", "right")
+    ]
+    rays = write(
+        tmp_path, "\n".join(["photo,point,x,y", *dict.fromkeys(both)]), "r.csv"
+    )
+    told = block(tables, "--rays", rays, "--json")
+    for name in ("degrees_of_freedom", "sigma0", "points"):
+        assert json.loads(told.stdout)[name] == plain[name]
+    assert "stand in" in told.stderr and "counts once" in words(told.stderr)
+
+
 @pytest.mark.slow
 def test_stations_inner_parameters_and_components(tables, written, tmp_path):
     """Stations are rows of the ground with this role; a wrong focal length is found."""

@@ -277,6 +277,28 @@ def test_damaged_parts_are_made_anew(tmp_path, monkeypatch):
             work(True, options.out)
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("pairs.html", "a table to be read"),
+        ("out/points.csv", "another result of this call"),
+        ("report.html", "another result of this call"),
+    ],
+)
+def test_a_file_takes_the_place_of_no_input_and_no_other_result(name, told, tmp_path):
+    """By force neither, and before anything is written."""
+    read = tmp_path / "pairs.html"
+    read.write_text("a table")
+    targets = [
+        (tmp_path / "out", whole.check_target),
+        (tmp_path / "report.html", whole.check_file),
+        (tmp_path / name, whole.check_file),
+    ]
+    with pytest.raises(TableError, match=told), whole.claim_all(targets, True, [read]):
+        pass
+    assert names(tmp_path) == {"pairs.html"} and read.read_text() == "a table"
+
+
 def test_what_was_read_is_compared_with_what_it_was(tmp_path):
     file = tmp_path / "a.csv"
     file.write_text("a")

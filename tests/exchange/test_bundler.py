@@ -93,6 +93,11 @@ def test_a_point_at_two_places_of_a_photo_is_left_out(path):
     found = exchange.read_bundler(path)
     assert found.pairs.lengths.tolist() == [28, 29, 29]
     assert "1 times a photo shows a point at two places" in found.warnings[0]
+    # the same place, found twice by a detector
+    lines[2 + 15 + 2 + 3] = " ".join(["4", *fields[1:], *fields[1:3], *fields[3:5]])
+    write(path, lines)
+    again = exchange.read_bundler(path)
+    assert again.pairs.lengths.tolist() == [29, 30, 29] and not again.warnings
 
 
 def change(line, new):

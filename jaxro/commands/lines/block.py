@@ -205,7 +205,7 @@ def block(
         unit=photo_unit,
         out=out,
         force=force,
-        documents=Documents(report, plots, json, force),
+        documents=Documents(report, plots, json),
     )
     options = Options(
         measured=measured,

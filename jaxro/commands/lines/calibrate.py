@@ -244,6 +244,6 @@ def calibrate(
         unit=unit,
         out=out,
         force=force,
-        documents=Documents(report, plots, json, force),
+        documents=Documents(report, plots, json),
     )
     end(lambda: run(options))

@@ -84,10 +84,11 @@ def clean(
         unit=unit,
         out=out,
         force=force,
-        documents=Documents(report, plots, json, force),
+        documents=Documents(report, plots, json),
     )
     name, changes = DEFAULT if procedure is None else procedure, tolerance or []
-    if given.large(file, parquet, resume, tables, engine):
+    together = bool(options.documents) or json or promise is not None
+    if given.large(file, parquet, resume, tables, engine, together):
         from .. import large
 
         if promise is not None:

@@ -59,7 +59,7 @@ def heights(
                 deviations=sd or [],
                 out=out,
                 force=force,
-                documents=Documents(report, plots, json, force),
+                documents=Documents(report, plots, json),
             )
         )
     )

@@ -309,11 +309,18 @@ Where = Annotated[
 
 
 def large(
-    file: Path | None, parquet: bool, resume: bool, tables: str | None, engine: Engine
+    file: Path | None,
+    parquet: bool,
+    resume: bool,
+    tables: str | None,
+    engine: Engine,
+    together: bool,
 ) -> bool:
     """Whether the results are Parquet tables, part by part; nothing that only these
-    know may be asked of others."""
-    wanted = parquet or resume or (file is not None and is_parquet(file))
+    know may be asked of others. `together`: whether all pairs are looked at together,
+    for a report, say: then a Parquet table is one as any other."""
+    from_parquet = file is not None and is_parquet(file) and not together
+    wanted = parquet or resume or from_parquet
     for name, given in (
         ("--tables", tables is not None),
         ("--engine", engine is not Engine.local),

@@ -67,11 +67,12 @@ def orient(
         unit=unit,
         out=out,
         force=force,
-        documents=Documents(report, plots, json, force),
+        documents=Documents(report, plots, json),
         confidence=confidence,
         g2o=g2o,
     )
-    if given.large(file, parquet, resume, tables, engine):
+    together = bool(options.documents) or json or g2o is not None
+    if given.large(file, parquet, resume, tables, engine, together):
         from .. import large
 
         end(
