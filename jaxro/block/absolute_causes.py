@@ -37,6 +37,8 @@ def find_cause(measured: MeasuredModel, found: AbsoluteOrientation) -> Cause | N
         return None
     at = np.where(known, np.asarray(measured.ground), np.nan)
     tried = alter(at, np.any(known, axis=1), "control points")
+    if not tried:
+        return None
     extent = float(np.max(np.nanmax(at, axis=0) - np.nanmin(at, axis=0)))
     best, cause = np.inf, None
     for one in tried:

@@ -42,6 +42,10 @@ class Bars(NamedTuple):
         """The same without the lengths of some bars, which keep their numbers."""
         return self._replace(length=np.where(rows, np.nan, self.length))
 
+    def are_in(self, block: MeasuredBlock) -> Bool[np.ndarray, " bar"]:
+        """Whether a block has both points of each bar."""
+        return np.all(np.stack(self.numbers_in(block)) >= 0, axis=0)
+
     def numbers_in(self, block: MeasuredBlock) -> tuple[np.ndarray, np.ndarray]:
         """The numbers of both points in a block, -1 where it has not got them."""
         number = {name: k for k, name in enumerate(block.points)}

@@ -57,8 +57,7 @@ def groups_of(given: Given, adjusted: BlockAdjustment, wrong: Wrong) -> list[Fit
         fits = np.any(np.isfinite(adjusted.control_residuals), axis=1)
     fits &= ~np.any(wrong.control, axis=1)
     count = lambda rows: int(np.sum(rows))
-    one, other = given.lengths.numbers_in(block)
-    bars = (one >= 0) & (other >= 0)
+    bars = given.lengths.are_in(block)
     used = np.isfinite(adjusted.bar_residuals) & ~wrong.bars
     of_points, of_stations = there & ~ground.station, there & ground.station
     return [

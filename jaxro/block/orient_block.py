@@ -11,7 +11,7 @@ from ..orientation.axes import tell_field
 from ..rejection import Recommended, Rejection
 from .adjust import BlockAdjustment
 from .adjust_chained import Outcome, adjust_chained
-from .bars import Bars
+from .bars import Bars, NoBar
 from .chain import Chained, Oriented, chain, models_of
 from .columns import Cause
 from .components import Component
@@ -66,10 +66,12 @@ def orient_block(
     `level`: the probability that anything is called wrong if nothing is; `components`:
     adjust with the standard deviations of places, known points and known stations as
     the residuals tell them; `sigma_known`: whether sigma0 is to be 1. Without `ground`
-    the network is free, its base lengths as the chain has them. Raises `Unjoined` and
-    `TooLittleControl` with what is missing.
+    the network is free, its base lengths as the chain has them. Raises `Unjoined`,
+    `TooLittleControl` and `NoBar` with what is missing.
     """
     block = from_pairs(left, right, pairs, points) if more is None else more
+    if bars is not None and not np.any(bars.are_in(block)):
+        raise NoBar("orient_block: no bar has both of its points in the block")
     chained, usable = chain_pairs(block, left, right, pairs)
     given = Given(block, ground, inner, bars)
     judged = adjust_and_judge(given, chained, level, components, sigma_known)

@@ -41,6 +41,11 @@ def show(console: Console, done: Done) -> None:
         show_control(console, done)
         show_check_points(console, done)
         show_bars(console, done)
+    elif done.contradictions and done.oriented.cause is None:
+        # what does not fit, so that it can be looked for
+        show_cameras(console, done)
+        show_control(console, done)
+        show_bars(console, done)
     for sentence in sentences(done):
         console.print(f"[yellow]Mind:[/yellow] {escape(sentence)}")
 
