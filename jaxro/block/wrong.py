@@ -326,4 +326,6 @@ def _worst(adjusted: BlockAdjustment, tested: Tested) -> Wrong:
         if free_points[point] and free_photos[photo]:
             rays[ray] = True
             free_points[point] = free_photos[photo] = False
-    return nothing._replace(rays=decide(adjusted, rays))
+    out = decide(adjusted, rays)
+    is_new = bool(np.any(out & adjusted.numbered.rays))
+    return nothing._replace(rays=out if is_new else rays)

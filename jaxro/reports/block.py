@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..adjustment import RESULTS
+from ..block.photos import find_copies
 from .block_files import ANGLES
 from .block_model import Done
 from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
@@ -314,7 +315,7 @@ def show_bars(console: Console, done: Done) -> None:
 
 def sentences(done: Done) -> list[str]:
     """What a careful user should know of the result."""
-    said = _of_pairs(done)
+    said = _of_pairs(done) + _of_photos(done)
     if done.usable:
         said += _of_fit(done) + _of_control(done) + _of_checks(done)
     if done.strange:
@@ -342,6 +343,22 @@ def _of_pairs(done: Done) -> list[str]:
     return [
         f"{len(failed)} pairs could not be oriented by themselves and served as places "
         f"of points only: {names}. jaxro clean tells why."
+    ]
+
+
+def _of_photos(done: Done) -> list[str]:
+    """Photos that came in twice, and those that one point holds."""
+    said = [
+        f"Photos {one} and {other} show their points at the same places: one photo under "
+        "two names, whose places are no second measurements."
+        for one, other in find_copies(done.adjusted.block)
+    ]
+    if not done.usable:
+        return said
+    return said + [
+        f"The scale of photo {held.photo} rests on point {held.point} alone, and nothing "
+        "checks it: measure more points that three photos show."
+        for held in done.held[:SHOWN]
     ]
 
 

@@ -13,6 +13,7 @@ from ..block.adjust import BlockAdjustment
 from ..block.bars import Bars, differences
 from ..block.measured_block import Ground
 from ..block.orient_block import OrientedBlock
+from ..block.photos import Held, find_held
 from ..block.reliability import BlockReliability, assess_block
 from ..block.wrong import Tested, normalise_residuals
 from .control import LEVEL, Compared
@@ -103,6 +104,16 @@ class Done:
         """How many rays of each photo are used."""
         block, used = self.adjusted.block, self.adjusted.numbered.rays
         return np.bincount(block.photo[used], minlength=len(block.photos))
+
+    @property
+    def held(self) -> list[Held]:
+        """The photos that a single point holds."""
+        adjusted, block = self.adjusted, self.adjusted.block
+        known = np.zeros(len(block.points), bool)
+        placed = np.zeros(len(block.photos), bool)
+        for part in adjusted.known:
+            (placed if part.station[0] else known)[part.number] = True
+        return find_held(block, adjusted.numbered.rays, known, placed)
 
     @property
     def determined(self) -> Bool[np.ndarray, " point"]:

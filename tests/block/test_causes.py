@@ -12,6 +12,7 @@ from jaxro.block.columns import alter
 from jaxro.block.contest import is_misplaced
 from jaxro.block.contradictions import contradictions, is_suspicious
 from jaxro.block.orient_block import adjust_and_judge
+from jaxro.block.photos import find_copies, find_held
 from jaxro.block.wrong_points import decide
 
 FOOT = 0.3048
@@ -198,3 +199,29 @@ def test_hypotheses_undo_what_they_name():
     ]
     found = metres[0].coordinates
     np.testing.assert_allclose(found - found[0], at - at[0], atol=3)
+
+
+def test_a_photo_under_two_names_and_one_that_a_point_holds_are_told():
+    mock, _ = strip()
+    measured = mock.block
+    own = measured.photo == 2
+    twice = measured._replace(
+        photos=(*measured.photos, "again"),
+        photo=np.append(measured.photo, np.full(np.sum(own), len(measured.photos))),
+        focal=np.append(measured.focal, measured.focal[2]),
+        **{
+            name: np.append(getattr(measured, name), getattr(measured, name)[own])
+            for name in ("point", "x", "y", "sigma")
+        },
+    )
+    assert find_copies(measured) == []
+    assert find_copies(twice) == [(measured.photos[2], "again")]
+    none = np.zeros(len(measured.points), bool), np.zeros(len(measured.photos), bool)
+    every = np.ones(len(measured.photo), bool)
+    assert find_held(measured, every, *none) == []
+    photos = np.bincount(measured.point, minlength=len(measured.points))
+    first = np.flatnonzero((measured.photo == 0) & (photos[measured.point] >= 3))
+    used = every.copy()
+    used[first[1:]] = False
+    (held,) = find_held(measured, used, *none)
+    assert held == (measured.photos[0], measured.points[measured.point[first[0]]])
