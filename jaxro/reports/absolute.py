@@ -65,7 +65,12 @@ def _verdict(done: Done) -> str:
         return f"[bold red]not usable[/bold red]: {escape(done.contradiction)}{CONTRADICTED}"
     if not done.usable:
         return f"[bold red]{done.result}[/bold red]: {advice(done)}"
-    text = f"[green]{_fits(done)}[/green]"
+    if done.freedom == 0 and not done.checks.names:
+        text = (
+            "[yellow]The control determines the model, and nothing checks it.[/yellow]"
+        )
+    else:
+        text = f"[green]{_fits(done)}[/green]"
     if done.result != "successful":
         text += f"\n[yellow]{done.result}[/yellow]: {RESULTS[done.first.result]}"
     if done.result == "two_solutions":

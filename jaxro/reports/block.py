@@ -54,7 +54,9 @@ def show(console: Console, done: Done) -> None:
 def contents_in_words(done: Done) -> str:
     """What the block consists of, and what is known of the ground."""
     block = done.adjusted.block
-    told = kinds_in_words(done.control.known)
+    told = kinds_in_words(done.fitting_control.known)
+    if number_wrong := len(_wrong_control(done)):
+        told += f", {number_wrong} left out as wrong"
     ground = "free network" if done.ground is None else f"control {told}"
     checks = f"; {len(done.checks.names)} check points" if done.ground else ""
     if done.bars is not None:
@@ -83,16 +85,24 @@ def verdict(done: Done) -> str:
             "[bold red]not settled[/bold red]: residuals beyond their limit are left "
             "after many rounds of tests; too much of the block is wrong"
         )
-    return f"[green]{escape(_fits(done))}[/green]"
+    checked = done.ground is None or done.checks_control or bool(done.checks.names)
+    colour = "green" if checked else "yellow"
+    return f"[{colour}]{escape(_fits(done))}[/{colour}]"
 
 
 def _fits(done: Done) -> str:
     """The photos, and the ground if there is any, in one sentence."""
     if done.ground is None:
         return "The photos fit each other; nothing is known of the ground."
-    text = f"The photos fit the control within {in_words(done.control, done.unit)}"
+    if not done.checks_control:
+        text = "The photos fit each other; nothing checks the control"
+    else:
+        rms = in_words(done.fitting_control, done.unit)
+        text = f"The photos fit the control within {rms}"
     if done.checks.names:
         text += f", and the check points within {in_words(done.checks, done.unit)}"
+    if not (done.checks_control or done.checks.names):
+        return f"{text}."
     return f"{text} (root mean squares)."
 
 
@@ -153,7 +163,7 @@ def _show_left_out(console: Console, done: Done) -> None:
     if control:
         console.print(
             f"[yellow]Control points left out as wrong:[/yellow] "
-            f"{escape(join_names(control, SHOWN))}"
+            f"{escape(', '.join(_sizes(done)))}"
         )
     if not rays:
         return
@@ -176,6 +186,21 @@ def _show_left_out(console: Console, done: Done) -> None:
 def _wrong_control(done: Done) -> list[str]:
     wrong = np.any(done.wrong_control & done.control.known, axis=1)
     return [done.control.names[k] for k in np.flatnonzero(wrong)]
+
+
+def _sizes(done: Done) -> list[str]:
+    """The control points that were left out, each with its largest difference and its
+    test."""
+    one = done.control
+    rows = np.flatnonzero(np.any(done.wrong_control & one.known, axis=1))
+    told = []
+    for k in rows[:SHOWN]:
+        sizes = np.where(one.known[k], np.abs(np.nan_to_num(one.w[k])), -1.0)
+        axis = int(np.argmax(sizes))
+        off = one.differences[k, axis]
+        size = f"{AXES[axis]} {number(off, 3)} {done.unit}, |d|/sd {number(sizes[axis], 1)}"
+        told.append(f"{one.names[k]} ({size})" if np.isfinite(off) else one.names[k])
+    return told + ["..."] * (len(rows) > SHOWN)
 
 
 def _wrong_bars(done: Done) -> list[str]:

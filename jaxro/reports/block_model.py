@@ -1,7 +1,7 @@
 """An adjusted block with its names, beside control and check points: what the report,
 the tables and the picture of `jaxro block` read."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -17,6 +17,9 @@ from ..block.photos import Held, find_held
 from ..block.reliability import BlockReliability, assess_block
 from ..block.wrong import Tested, normalise_residuals
 from .control import LEVEL, Compared
+
+LEAST_CHECKED = 0.1
+"""Sum of the redundancy numbers of the control up to which nothing checks it."""
 
 LEAST = 1e-12
 """What stands for a standard deviation of zero where it divides."""
@@ -160,6 +163,17 @@ class Done:
         used = np.isfinite(self.adjusted.control_residuals[rows])
         untested = used & ~np.isfinite(self.tested.control[rows])
         return self._compare(rows, np.where(untested, np.nan, w))
+
+    @property
+    def fitting_control(self) -> Compared:
+        """The control without what was left out as wrong."""
+        known = self.control.known & ~self.wrong_control
+        return replace(self.control, known=known)
+
+    @property
+    def checks_control(self) -> bool:
+        """Whether anything checks the control."""
+        return bool(np.sum(self.control_redundancy) > LEAST_CHECKED)
 
     @property
     def control_redundancy(self) -> Float[np.ndarray, "control 3"]:

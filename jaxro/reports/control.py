@@ -70,7 +70,9 @@ def add_rows(
 ) -> None:
     """A row for each of the worst points: differences, redundancies, largest |w|."""
     sizes = np.max(np.abs(np.nan_to_num(one.w)), axis=1, initial=0.0)
-    decimals = max([digits(r, 1) for r in one.rms() if np.isfinite(r)], default=3)
+    # one bad point is not to hide the digits of the others
+    typical = np.median(np.abs(one.differences[one.known])) if np.any(one.known) else 0
+    decimals = digits(float(typical), 1)
     cell = lambda value, there, places: number(value, places) if there else ""
     for k in worst(list(range(len(one.names))), lambda k: -sizes[k]):
         cells = [
