@@ -86,7 +86,8 @@ def assess_block(
     rays, control = adjusted.redundancy, adjusted.control_redundancy
     tested = np.sum(rays > UNCHECKED) + np.sum(control > UNCHECKED)
     if familywise:
-        level = float(critical.sidak(level, max(int(tested), 1)))
+        number = max(min(int(tested), adjusted.degrees_of_freedom), 1)
+        level = float(critical.sidak(level, number))
     delta0 = float(critical.delta_normal(level, power))
     sigma = np.repeat(adjusted.block.sigma[:, None], 2, axis=1)
     of_control = np.zeros((0, 3)) if adjusted.ground is None else adjusted.ground.sigma

@@ -229,7 +229,10 @@ def normalise_residuals(adjusted: BlockAdjustment, level: float = 0.05) -> Teste
             adjusted.bar_residuals, adjusted.bars.sigma * unit, adjusted.bar_redundancy
         )
     number = sum(int(np.sum(np.isfinite(w))) for w in (rays, control, bars))
-    each = critical_values.sidak(level, max(number, 1))
+    # of the w of a point on two photos all are one: no more tests are independent than
+    # there are degrees of freedom
+    number = max(min(number, adjusted.degrees_of_freedom), 1)
+    each = critical_values.sidak(level, number)
     return Tested(rays, control, bars, float(critical_values.normal(each)))
 
 

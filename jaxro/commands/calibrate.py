@@ -32,6 +32,7 @@ from ..tables.examples import calibration as example
 from ..tables.fields import TableError
 from ..tables.images import NamedImages
 from ..xla.programs import compiled
+from .calibration_columns import MISFIT, find_cause
 from .calibration_request import Options, Task, prepare
 from .calibration_tests import Alone, compare_distortions, tested_zones
 from .corrected import Wanted, corrected_texts, read_wanted
@@ -180,6 +181,7 @@ def calibrate(options: Options, task: Task, told: Callable[..., None]) -> Done:
             differences=differences,
             **common,
         )
+    check_columns(options, task, done)
     check_support(done)
     zones = {} if task.together else tested_zones(done.photos, task.known)
     return replace(done, zones=zones)
@@ -353,7 +355,8 @@ def check_direction(options: Options, task: Task, measured: MeasuredImage) -> No
         given,
         found=f"an image that is mirrored then (one focal length: sigma0 "
         f"{sigma0[0]:.3g}, with {other} {sigma0[1]:.3g})",
-        expected=f"{other}, or neither of them: the points tell it",
+        expected=f"{other}, or neither of them: the points tell it; or X and Y of the "
+        "object points are exchanged",
     )
 
 
@@ -393,6 +396,33 @@ def _most_solid(task: Task) -> MeasuredImage | None:
     rows = np.flatnonzero(known & (named.image == image))
     measured = one_image(task, rows, None, room=_room(named))
     return None if _is_flat(measured) else measured
+
+
+def check_columns(options: Options, task: Task, done: Done) -> None:
+    """Raises TableError where a whole column of the object points explains why an image
+    does not fit."""
+    rows = list(done.variants.values()) or [[]]
+    for image, one in enumerate(done.photos):
+        tried = rows[min(image, len(rows) - 1)]
+        simplest = min(tried, key=lambda v: v.unknowns, default=None)
+        plain = 0.0 if simplest is None else simplest.sigma0
+        far = plain > MISFIT * float(one.found.focal[0])
+        if bool(one.found.usable) and not far:
+            continue
+        named = task.named
+        own = named.rows_of(image)
+        known = own[named.known[named.point[own]]]
+        if len(known) < FEWEST:
+            continue
+        measured = one_image(task, known, None, room=_room(named))
+        with say_what("Looking for wrong columns of the object points ..."):
+            cause = find_cause(measured, task.models[0].rays, task.known)
+        if cause is not None:
+            raise TableError(
+                options.object or named.file,
+                found=f"object points that image {one.name!r} contradicts",
+                expected=f"other ones. {cause.sentence}",
+            )
 
 
 def check_support(done: Done) -> None:

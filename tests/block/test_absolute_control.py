@@ -147,7 +147,7 @@ def test_points_that_are_not_finite_have_no_control():
     ("arguments", "said"),
     [
         ({"ground": np.zeros((3, 3))}, "of the same points"),
-        ({"sigma": 1.0, "covariance": np.zeros((12, 12))}, "not both"),
+        ({"sigma": 1.0, "covariance": np.zeros((12, 12))}, "one of sigma, covariance"),
         ({"covariance": np.zeros((6, 6))}, "has the shape"),
         ({"covariance": np.zeros((4, 3, 3))}, "positive definite"),
         ({"covariance": np.kron(2 - np.eye(4), np.eye(3))}, "not positive"),

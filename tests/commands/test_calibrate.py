@@ -48,7 +48,8 @@ def files(folder, film):
 
 def test_few_points_leave_no_choice_and_a_contradiction_is_not_usable(tmp_path):
     """Four points and a known camera: residuals of one focal length, not of a lens that
-    makes them vanish. Object heights in feet do not fit: with sigma this is told."""
+    makes them vanish. Object heights in feet are named, a sigma that is far too small is
+    contradicted."""
     rng = np.random.default_rng(7)
     points = np.array([[-4, -3, 0], [4, -3, 1], [-4, 3, -1], [4, 3, 2], [0, 0.5, -2.0]])
     places = taken(rng, points, np.array([0.5, 0.3, 12.0]), (0.02, -0.03, 0.1))
@@ -57,10 +58,13 @@ def test_few_points_leave_no_choice_and_a_contradiction_is_not_usable(tmp_path):
     found = run("calibrate", image, "--object", known, *camera)
     assert found.exit_code == 0
     assert "One focal length: too few points for a choice" in words(found.stdout)
+    options = "--sigma", SIGMA / 1000, "--model", "one-f"
+    found = run("calibrate", image, "--object", known, *camera, *options)
+    assert found.exit_code == 1 and found.stdout.count("contradicted: ") == 1
     feet = one_image(tmp_path, places, points * [1, 1, 3.2808])[1]
     options = "--sigma", SIGMA, "--model", "one-f"
     found = run("calibrate", image, "--object", feet, *camera, *options)
-    assert found.exit_code == 1 and found.stdout.count("contradicted: ") == 1
+    assert found.exit_code == 2 and "they are in feet" in words(found.stderr)
 
 
 @pytest.mark.slow

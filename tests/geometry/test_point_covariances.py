@@ -434,11 +434,11 @@ def test_csv_and_parquet_tables_hold_the_same(tmp_path):
         f"pair,{TABLE},cov_xy_left\n" + "".join(f"a,{r}\n" for r in rows.split())
     )
     for name, convert in (
-        ("quick", conversion._convert_quickly),
+        ("quick", lambda file, made: conversion._convert_quickly(file, made, ".")),
         ("careful", conversion._convert_carefully),
     ):
         target = tmp_path / f"{name}.parquet"
-        convert(source, target, False)
+        convert(source, target)
         read = parquet.Source(target)
         assert read.has_sigma and read.has_covariances
         table = read.read(read.scan().begins)
