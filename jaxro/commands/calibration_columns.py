@@ -22,9 +22,7 @@ LEVEL = 1e-4
 """Probability that a cause is named although there is none."""
 
 
-def find_cause(
-    measured: MeasuredImage, rays: Rays, known: Known | None
-) -> Cause | None:
+def find_cause(measured: MeasuredImage, rays: Rays, known: Known) -> Cause | None:
     """The hypothesis about all object points of an image under which one focal length
     explains it, where it does not by what was given. The mirror image is not tried: an
     image tells the direction of its y by itself."""
