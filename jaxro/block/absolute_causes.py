@@ -5,18 +5,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..adjustment import critical_values as critical
 from .absolute import orient_model
 from .absolute_model import MeasuredModel
 from .absolute_result import AbsoluteOrientation
 from .absolute_verdict import RESULTS
-from .columns import UNCERTAIN, Altered, Cause, alter
-
-LEVEL = 1e-4
-"""Probability that a cause is named although there is none."""
-
-FACTOR = 5.0
-"""By so much sigma0 falls at least."""
+from .columns import LEVEL, UNCERTAIN, Altered, Cause, alter, falls
 
 FITS = 0.01
 """sigma0 over the extent of the control below which a model fits that did not fit at all
@@ -64,10 +57,8 @@ def _compare(
         # without any fit before there is nothing to compare with
         typical = float(jnp.sqrt(jnp.median(measured.variance)))
         return sigma0 if sigma0 * typical < FITS * extent else np.inf
-    before = float(found.sigma0)
-    ratio = (before / max(sigma0, 1e-300)) ** 2
-    chance = float(critical.fisher_p(ratio, int(found.degrees_of_freedom), freedom))
-    fits = before > FACTOR * sigma0 and chance * tries < LEVEL
+    before = float(found.sigma0), int(found.degrees_of_freedom)
+    fits = falls(*before, sigma0, freedom) * tries < LEVEL
     return sigma0 if fits else np.inf
 
 

@@ -21,6 +21,7 @@ from ..adjustment.sparse import (
 from ..calibration.camera import Station
 from ..xla.programs import compiled
 from .bars import Bars, no_bars
+from .given import Given
 from .inner import Inner, InnerParameters, cameras_of, in_photo_units
 from .measured_block import Ground, MeasuredBlock
 from .network import (
@@ -299,7 +300,7 @@ def adjust_block(
     one photo, of which nothing else is known, are left out. Failures are values of
     `adjustment.result`.
     """
-    prepared = prepare_block(block, start, ground, inner, left_out, bars)
+    prepared = prepare_block(Given(block, ground, inner, bars), start, left_out)
     return conclude(prepared, minimise(prepared.problem, datum=prepared.datum))
 
 

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..adjustment import critical_values as critical
+
 FOOT = 0.3048
 """Metres in a foot."""
 
@@ -36,6 +38,12 @@ AXIS, FLATTENING = 6_378_137.0, 1 / 298.257
 DEGREES = (("longitude, latitude", (0, 1)), ("latitude, longitude", (1, 0)))
 """The order of degrees, and the columns of longitude and latitude."""
 
+FACTOR = 5.0
+"""By so much sigma0 falls at least under a cause."""
+
+LEVEL = 1e-4
+"""Probability that a cause is named although there is none."""
+
 UNCERTAIN = 0.1
 """Standard deviation of a height of which nothing is known, over the extent in plan."""
 
@@ -51,6 +59,9 @@ class Cause(NamedTuple):
 
     name: str
     sentence: str
+    is_hint: bool = False
+    """Whether it is about how was measured, while nothing contradicts what is known: then
+    the numbers may be used."""
 
 
 class Altered(NamedTuple):
@@ -62,6 +73,15 @@ class Altered(NamedTuple):
     sentence: str
     coordinates: Known
     unknown: Bool[np.ndarray, "known 3"]
+
+
+def falls(before: float, freedom: int, after: float, freedom_after: int) -> float:
+    """The probability that sigma0 falls so far by chance (F test); 1 where it does not
+    fall to a part of 1 / `FACTOR`."""
+    ratio = (before / max(after, 1e-300)) ** 2
+    if ratio <= FACTOR**2:
+        return 1.0
+    return float(critical.fisher_p(ratio, freedom, freedom_after))
 
 
 def alter(coordinates: Known, rows: Rows, who: str) -> list[Altered]:

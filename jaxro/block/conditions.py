@@ -19,6 +19,7 @@ from ..adjustment.normal_equations import SINGULAR
 from .adjust import Prepared, prepare_block
 from .conditions_of_block import problem_of
 from .conditions_of_models import Linearised, Problem, advance
+from .given import Given
 from .measured_block import Ground, MeasuredBlock
 from .network import Start, points_of
 
@@ -76,7 +77,7 @@ def adjust_conditions(
     be adjusted together, for a single photo, for two places of a point on one photo,
     and for neighbouring rays that are parallel. Other failures are values of `result`.
     """
-    prepared = prepare_block(block, start, ground)
+    prepared = prepare_block(Given(block, ground), start)
     problem = problem_of(prepared, start)
     models = len(block.photos) - 1
     # five of each, and the lengths of all bases but one

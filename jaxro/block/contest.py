@@ -21,20 +21,25 @@ from ..adjustment import RESULTS
 from .adjust import BlockAdjustment
 from .adjust_chained import Outcome, adjust_chained
 from .bars import differences
-from .chain import Chained, intersect
+from .chain import Chained
 from .columns import EQUAL_HEIGHTS, UNCERTAIN, Altered, Cause, alter
 from .contradictions import contradictions
 from .given import Given
 from .inner import Inner
 from .measured_block import Ground
-from .place import TooLittleControl, place, similarities
+from .place import TooLittleControl, known_in_chain, place, similarities
 from .wrong import CLEAR
 
 CUT = CLEAR**2
 """What a coordinate costs at most, and an unknown."""
 
+MARGIN = 2 * CUT
+"""D falls by more than this under a cause: that is so of the best one of many places,
+however many others fit as well before."""
+
 BETTER = 0.9
-"""Part of D that a cause leaves at most."""
+"""Part of D that another camera, or larger standard deviations, leave at most: hardly a
+lens is free of the last micrometre of distortion."""
 
 CLEARLY = 1.5
 """D for each coordinate at which no other cause is looked for: 1 is expected."""
@@ -43,7 +48,8 @@ TRIED = 4
 """Hypotheses about the ground that are adjusted, of those that place the block best."""
 
 WELL_PLACED = 0.5
-"""Part of the misfits of the known points that such a hypothesis leaves at most."""
+"""Part of the misfits of the known points that a hypothesis leaves at most, to be looked
+at where nothing else is suspicious."""
 
 
 class Hypothesis(NamedTuple):
@@ -56,6 +62,11 @@ class Hypothesis(NamedTuple):
     unknowns: int = 0
     factor: float = 1.0
 
+    @property
+    def of_ground(self) -> bool:
+        """Whether it is about what is known, and not about how it was measured."""
+        return self.unknowns == 0
+
 
 def find_cause(
     given: Given,
@@ -64,12 +75,15 @@ def find_cause(
     level: float = 0.05,
     *,
     sigma_known: bool = True,
+    ground_alone: bool = False,
 ) -> tuple[Cause, Outcome] | None:
     """The hypothesis that explains everything, with the adjustment under it; None where
-    there is none. `outcome`: of what was given, None where it could not be adjusted."""
+    there is none. `outcome`: of what was given, None where it could not be adjusted;
+    `ground_alone`: without hypotheses about cameras and standard deviations, which
+    compile programs of their own."""
     usual = np.inf if outcome is None else _deviance(given, outcome, 0, 1.0)
-    best, found = BETTER * usual, None
-    for one in _hypotheses(given, chained, outcome, sigma_known):
+    best, found = usual - MARGIN, None
+    for one in _hypotheses(given, chained, outcome, sigma_known, ground_alone):
         tried = _adjust(one.given, chained, level)
         if tried is None or tried.adjusted.result != RESULTS.successful:
             continue
@@ -77,9 +91,10 @@ def find_cause(
         left = contradictions(
             one.given, tried.adjusted, tried.wrong, sigma_known=sigma_known
         )
-        if cost < best and tried.wrong.settled and not left:
+        is_better = one.of_ground or cost < BETTER * usual
+        if cost < best and is_better and tried.wrong.settled and not left:
             best, found = cost, (Cause(one.name, one.say(tried)), tried)
-            if one.unknowns == 0 and cost < CLEARLY * _coordinates(given):
+            if one.of_ground and cost < CLEARLY * _coordinates(given):
                 break
     return found
 
@@ -87,7 +102,7 @@ def find_cause(
 def is_misplaced(given: Given, chained: Chained) -> bool:
     """Whether some hypothesis about the ground places the chained block far better, or
     all heights are one: a strip may bend until they fit."""
-    return bool(_of_ground(given, chained))
+    return bool(_of_ground(given, chained, WELL_PLACED))
 
 
 def _coordinates(given: Given) -> int:
@@ -129,19 +144,25 @@ def _deviance(given: Given, outcome: Outcome, unknowns: int, factor: float) -> f
 
 
 def _hypotheses(
-    given: Given, chained: Chained, outcome: Outcome | None, sigma_known: bool
+    given: Given,
+    chained: Chained,
+    outcome: Outcome | None,
+    sigma_known: bool,
+    ground_alone: bool,
 ) -> Iterator[Hypothesis]:
     """All of them, the cheap ones first."""
     yield from _of_ground(given, chained)
     yield from _of_bars(given, outcome)
+    if ground_alone:
+        return
     yield from _of_cameras(given)
     if outcome is not None and sigma_known:
         yield from _of_sigma(given, outcome)
 
 
-def _of_ground(given: Given, chained: Chained) -> list[Hypothesis]:
+def _of_ground(given: Given, chained: Chained, most: float = 1.0) -> list[Hypothesis]:
     """Whole columns of the known points, of the stations, or of both; those that place
-    the chained block best."""
+    the chained block best, and leave at most this part of the misfits."""
     ground = given.ground
     if ground is None:
         return []
@@ -157,7 +178,7 @@ def _of_ground(given: Given, chained: Chained) -> list[Hypothesis]:
             tried.append((_known_by(ground, one), one.name, one.sentence))
     if (shifted := _shift_stations(given, chained)) is not None:
         tried.append(shifted)
-    limit = WELL_PLACED * _misplaced(given, chained, ground)
+    limit = most * _misplaced(given, chained, ground)
     # what is unknown does not show in where a block is placed
     sizes = [
         0.0 if name == EQUAL_HEIGHTS else _misplaced(given, chained, changed)
@@ -199,14 +220,8 @@ def _shift_stations(given: Given, chained: Chained) -> tuple[Ground, str, str] |
     say. Points and stations, each about their middle, tell rotation and scale."""
     ground = given.known
     whole = np.all(np.isfinite(ground.coordinates), axis=1) & ~ground.check
-    number = ground.numbers_in(given.block)
-    there, safe = number >= 0, np.maximum(number, 0)
-    model = np.where(
-        ground.station[:, None],
-        chained.centres[np.where(ground.station, safe, 0)],
-        intersect(given.block, chained)[np.where(ground.station, 0, safe)],
-    )
-    use = whole & there & np.all(np.isfinite(model), axis=1)
+    model = known_in_chain(given.block, chained, ground)
+    use = whole & np.all(np.isfinite(model), axis=1)
     sets = [np.flatnonzero(use & which) for which in (~ground.station, ground.station)]
     if any(len(rows) == 0 for rows in sets) or sum(map(len, sets)) < 4:
         return None
@@ -288,6 +303,9 @@ def _figures(adjusted: BlockAdjustment) -> str:
     ]
     return ", ".join(told)
 
+
+OF_MEASUREMENT = (*(name for _, name, _ in CAMERA), "sigma")
+"""The names of hypotheses about how was measured."""
 
 SPREAD = 1.4826
 """A normal standard deviation over the median of its absolute values."""

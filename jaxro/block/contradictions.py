@@ -86,12 +86,26 @@ def contradictions(
         f"{out} of {number} places of photo {name} do not fit the others."
         for name, number, out in _photos_out(given, rays)
     ]
-    if sigma_known and _is_far(adjusted):
-        said.append(
-            f"The residuals are {adjusted.sigma0:.2g} times what the standard deviations "
-            "say."
-        )
+    if sigma_known:
+        said += tell_sigma0(adjusted.sigma0, adjusted.degrees_of_freedom)
     return said
+
+
+def tell_sigma0(sigma0: float, freedom: int) -> list[str]:
+    """A sentence on a sigma0 that fails by far; none of one that does not."""
+    if not (sigma0 > FAR and _chance(sigma0, freedom) < NEVER):
+        return []
+    return [f"The residuals are {sigma0:.3g} times what the standard deviations say."]
+
+
+def stands_under_ground(adjusted: BlockAdjustment) -> bool:
+    """Whether all photos stand under the points that they show: the mirror image of a
+    block over flat ground fits as well, from below."""
+    if not adjusted.known:
+        return False
+    block, used = adjusted.block, adjusted.numbered.rays
+    above = adjusted.centres[block.photo, 2] - adjusted.coordinates[block.point, 2]
+    return bool(np.all(above[used] < 0))
 
 
 def is_suspicious(
@@ -105,7 +119,8 @@ def is_suspicious(
     known = any(
         group.given - group.fitting > max(1, group.given / 4) for group in groups
     )
-    doubtful = sigma_known and adjusted.sigma0 > 1 and _chance(adjusted) < DOUBTFUL
+    chance = _chance(adjusted.sigma0, adjusted.degrees_of_freedom)
+    doubtful = sigma_known and adjusted.sigma0 > 1 and chance < DOUBTFUL
     return (
         known
         or bool(np.any(wrong.bars))
@@ -128,13 +143,8 @@ def _photos_out(
     ]
 
 
-def _is_far(adjusted: BlockAdjustment) -> bool:
-    return adjusted.sigma0 > FAR and _chance(adjusted) < NEVER
-
-
-def _chance(adjusted: BlockAdjustment) -> float:
+def _chance(sigma0: float, freedom: int) -> float:
     """The probability of a sigma0 that is farther from 1."""
-    freedom = adjusted.degrees_of_freedom
     if freedom <= 0:
         return 1.0
-    return float(critical_values.global_p(freedom * adjusted.sigma0**2, freedom))
+    return float(critical_values.global_p(freedom * sigma0**2, freedom))

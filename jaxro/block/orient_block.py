@@ -15,8 +15,8 @@ from .bars import Bars, NoBar
 from .chain import Chained, Oriented, chain, models_of
 from .columns import Cause
 from .components import Component
-from .contest import find_cause, is_misplaced
-from .contradictions import contradictions, is_suspicious
+from .contest import OF_MEASUREMENT, find_cause, is_misplaced
+from .contradictions import contradictions, is_suspicious, stands_under_ground
 from .given import Given, Wrong
 from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, from_pairs
@@ -97,7 +97,7 @@ def adjust_and_judge(
 ) -> Judged:
     """Adjust a chained block and, where much of what was given does not fit, look for
     the cause. Raises `TooLittleControl`."""
-    outcome, refused = None, None
+    outcome, refused, suspicious = None, None, True
     try:
         outcome = adjust_chained(given, chained, level, components)
     except TooLittleControl as error:
@@ -105,11 +105,21 @@ def adjust_and_judge(
     if outcome is not None:
         rest = given, outcome.adjusted, outcome.wrong
         suspicious = is_suspicious(*rest, sigma_known=sigma_known)
-        if not suspicious and not is_misplaced(given, chained):
+        of_ground = bool(np.any(outcome.wrong.control)) or stands_under_ground(
+            outcome.adjusted
+        )
+        if not (suspicious or of_ground or is_misplaced(given, chained)):
             return Judged(outcome)
     cause, explained = _of_field(given), None
     if cause is None:
-        found = find_cause(given, chained, outcome, level, sigma_known=sigma_known)
+        found = find_cause(
+            given,
+            chained,
+            outcome,
+            level,
+            sigma_known=sigma_known,
+            ground_alone=not suspicious,
+        )
         cause, explained = (None, None) if found is None else found
     outcome = explained if outcome is None else outcome
     if outcome is None:
@@ -117,6 +127,8 @@ def adjust_and_judge(
         raise refused
     rest = given, outcome.adjusted, outcome.wrong
     against = contradictions(*rest, sigma_known=sigma_known)
+    if cause is not None and cause.name in OF_MEASUREMENT and not against:
+        cause = cause._replace(is_hint=True)
     return Judged(outcome, tuple(against), cause)
 
 

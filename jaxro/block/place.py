@@ -58,12 +58,7 @@ def place(
 ) -> Placed:
     """The similarity that takes a chained block to its known points. Raises
     `TooLittleControl`."""
-    number = ground.numbers_in(block)
-    there = np.maximum(number, 0)
-    points = intersect(block, chained)[np.where(ground.station, 0, there)]
-    stations = chained.centres[np.where(ground.station, there, 0)]
-    model = np.where(ground.station[:, None], stations, points)
-    model[number < 0] = np.nan
+    model = known_in_chain(block, chained, ground)
     at = np.where(ground.check[:, None], np.nan, ground.coordinates)
     whole = np.flatnonzero(np.all(np.isfinite(model) & np.isfinite(at), axis=1))
     if len(whole) < 3:
@@ -98,6 +93,19 @@ def place(
         apart=np.where(known[best], left, np.nan),
         wrong=wrong,
     )
+
+
+def known_in_chain(
+    block: MeasuredBlock, chained: Chained, ground: Ground
+) -> Float[np.ndarray, "known 3"]:
+    """Where the known points and stations are in a chained block, NaN where it has not
+    got them."""
+    number = ground.numbers_in(block)
+    there = np.maximum(number, 0)
+    points = intersect(block, chained)[np.where(ground.station, 0, there)]
+    stations = chained.centres[np.where(ground.station, there, 0)]
+    model = np.where(ground.station[:, None], stations, points)
+    return np.where((number >= 0)[:, None], model, np.nan)
 
 
 def _by_all_coordinates(

@@ -20,6 +20,7 @@ from jaxtyping import ArrayLike, Bool, Float
 from ..adjustment import RESULTS
 from ..adjustment.sparse import Minimum
 from .adjust import BlockAdjustment, conclude, prepare_block
+from .given import Given
 from .measured_block import Ground, MeasuredBlock
 from .network import Start
 
@@ -108,7 +109,7 @@ def plan_block(
     1: everything that follows from a `BlockAdjustment`, of the planned stations and
     points. Of `ground` only the names, the standard deviations and which coordinates
     are known count; of `block` not the places. Residuals say nothing."""
-    prepared = prepare_block(block, start, ground)
+    prepared = prepare_block(Given(block, ground), start)
     at_once = Minimum(prepared.problem, 0, RESULTS.successful)
     planned = conclude(prepared, at_once)
     return replace(planned, adjustment=replace(planned.adjustment, sigma0=1.0))

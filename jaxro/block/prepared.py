@@ -10,8 +10,9 @@ from ..adjustment.sparse import DatumOf, Minimum, Problem, prepare, trimmed
 from ..calibration.camera import Station
 from .bars import Bars, bar_terms, no_bars
 from .datum import free_datum
+from .given import Given
 from .inner import Inner, cameras_of
-from .measured_block import Ground, MeasuredBlock, nothing_known
+from .measured_block import Ground, MeasuredBlock
 from .network import (
     Frame,
     KnownCoordinates,
@@ -70,16 +71,12 @@ def start_of(
 
 
 def prepare_block(
-    block: MeasuredBlock,
-    start: Start,
-    ground: Ground | None = None,
-    inner: Inner | None = None,
-    left_out: Bool[np.ndarray, " ray"] | None = None,
-    bars: Bars | None = None,
+    given: Given, start: Start, left_out: Bool[np.ndarray, " ray"] | None = None
 ) -> Prepared:
     """The problem of a block at its approximate values, some rays left out."""
+    block, ground, inner, bars = given
     units = frame_of(start)
-    known = known_of(block, nothing_known() if ground is None else ground)
+    known = known_of(block, given.known)
     use = np.ones(len(block.photo), bool) if left_out is None else ~left_out
     # a known point on one photo begins where it is known to be
     points, of_points = start.points.copy(), known.take(~known.station)

@@ -112,7 +112,7 @@ def _without_bars(
         adjusted, wrong = _test(given, plain, nothing, level, FEW)
         if wrong.settled:
             return adjusted, wrong
-    prepared = _prepare(given, start)
+    prepared = prepare_block(given, start)
     found = settle(prepared)
     wrong = _far(prepared, found)
     used = wrong.rays[prepared.numbered.rays]
@@ -180,12 +180,6 @@ def adjust_rest(given: Given, start: Start, wrong: Wrong) -> BlockAdjustment:
         wrong.rays,
         None if given.bars is None else given.bars.without(wrong.bars),
     )
-
-
-def _prepare(given: Given, start: Start) -> Prepared:
-    """The problem of everything that is given."""
-    block, ground, inner, bars = given
-    return prepare_block(block, start, ground, inner, bars=bars)
 
 
 def _known_rest(given: Given, wrong: Wrong) -> Ground | None:

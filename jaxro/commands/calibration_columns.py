@@ -6,20 +6,13 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from ..adjustment import critical_values as critical
-from ..block.columns import EQUAL_HEIGHTS, Cause, alter
+from ..block.columns import EQUAL_HEIGHTS, LEVEL, Cause, alter, falls
 from ..calibration import Calibration, MeasuredImage, Model, calibrate
 from ..calibration.camera import Rays
 from ..calibration.known import Known
 
 MISFIT = 1e-3
 """Residuals over the focal length from which on a cause is looked for."""
-
-FACTOR = 5.0
-"""By so much sigma0 falls at least under a cause."""
-
-LEVEL = 1e-4
-"""Probability that a cause is named although there is none."""
 
 
 def find_cause(measured: MeasuredImage, rays: Rays, known: Known) -> Cause | None:
@@ -66,6 +59,5 @@ def _is_better(found: Calibration, before: Calibration, tries: int) -> bool:
         return False
     if not bool(before.usable):
         return True
-    ratio = (float(before.sigma0) / max(float(found.sigma0), 1e-300)) ** 2
-    chance = float(critical.fisher_p(ratio, int(before.degrees_of_freedom), freedom))
-    return ratio > FACTOR**2 and chance * tries < LEVEL
+    was = float(before.sigma0), int(before.degrees_of_freedom)
+    return falls(*was, float(found.sigma0), freedom) * tries < LEVEL

@@ -61,6 +61,8 @@ def _verdict(done: Done) -> str:
         return (
             f"[bold red]not usable as given[/bold red]: {escape(done.cause.sentence)}."
         )
+    if done.contradiction and done.suspects:
+        return f"[bold red]not usable[/bold red]: {escape(_of_suspects(done)[0])}"
     if done.contradiction:
         return f"[bold red]not usable[/bold red]: {escape(done.contradiction)}{CONTRADICTED}"
     if not done.usable:
@@ -166,7 +168,8 @@ def _points(console: Console, done: Done) -> None:
 
 def sentences(done: Done) -> list[str]:
     """What a careful user should know of the result."""
-    said = _of_suspects(done)
+    # what the verdict says is not said twice
+    said = [] if done.contradiction else _of_suspects(done)
     if done.usable:
         said += (
             _of_fit(done) + _of_control(done) + _of_checks(done) + _of_position(done)

@@ -10,7 +10,7 @@ from ..adjustment import critical_values as critical
 from ..block.absolute_result import NAMES, AbsoluteOrientation
 from ..block.absolute_verdict import RESULTS
 from ..block.columns import Cause
-from ..block.contradictions import FAR, FITTING, NEVER
+from ..block.contradictions import FITTING, tell_sigma0
 from ..tables.ground import GroundPoints
 from ..tables.model import ModelPoints
 from . import files
@@ -87,15 +87,9 @@ class Done:
             return (
                 f"Only {np.sum(fit)} of {np.sum(known)} control points fit the model."
             )
-        if self.sigma_known and bool(self.first.usable) and self.freedom > 0:
-            sigma0 = float(self.first.sigma0)
-            chance = float(critical.global_p(self.freedom * sigma0**2, self.freedom))
-            if sigma0 > FAR and chance < NEVER:
-                return (
-                    f"The residuals are {sigma0:.3g} times what the standard deviations "
-                    "say."
-                )
-        return ""
+        if not (self.sigma_known and bool(self.first.usable)):
+            return ""
+        return " ".join(tell_sigma0(float(self.first.sigma0), self.freedom))
 
     @property
     def freedom(self) -> int:

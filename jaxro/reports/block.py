@@ -6,26 +6,19 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..adjustment import RESULTS
-from ..block.photos import find_copies
 from .block_files import ANGLES
 from .block_model import Done
+from .block_sentences import SHOWN, sentences
 from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
-from .pair import digits, join_names, table
-from .reliability import DOUBTFUL
+from .pair import digits, table
 from .rows import left_out, most_rows, worst
 from .text import number
-
-POORLY = 0.1
-"""Redundancy below which a control coordinate is said to be poorly checked."""
 
 CONTRADICTED = (
     " So much is no single error, and no cause that was tried explains it: look at names, "
     "axes, units and coordinate systems, and at the camera."
 )
 """What is to be done about a block that what is known contradicts."""
-
-SHOWN = 10
-"""Names that a sentence tells of a longer list."""
 
 
 def show(console: Console, done: Done) -> None:
@@ -73,7 +66,8 @@ def contents_in_words(done: Done) -> str:
 
 def verdict(done: Done) -> str:
     """Whether the numbers may be used, in one sentence."""
-    if (cause := done.oriented.cause) is not None:
+    cause = done.oriented.cause
+    if cause is not None and not done.usable:
         return f"[bold red]not usable as given[/bold red]: {escape(cause.sentence)}."
     if done.contradictions:
         told = " ".join(done.contradictions)
@@ -87,7 +81,10 @@ def verdict(done: Done) -> str:
         )
     checked = done.ground is None or done.checks_control or bool(done.checks.names)
     colour = "green" if checked else "yellow"
-    return f"[{colour}]{escape(_fits(done))}[/{colour}]"
+    told = f"[{colour}]{escape(_fits(done))}[/{colour}]"
+    if cause is not None:
+        return f"[yellow]{escape(cause.sentence)}.[/yellow]\n{told}"
+    return told
 
 
 def _fits(done: Done) -> str:
@@ -332,122 +329,3 @@ def show_bars(console: Console, done: Done) -> None:
         tests = number(redundancy, 2), number(abs(w), 2)
         rows.add_row(escape(one), escape(other), *cells, *tests)
     console.print(rows)
-
-
-# -------------------------------------------------------------------------------------
-# what to mind
-
-
-def sentences(done: Done) -> list[str]:
-    """What a careful user should know of the result."""
-    said = _of_pairs(done) + _of_photos(done)
-    if done.usable:
-        said += _of_fit(done) + _of_control(done) + _of_checks(done)
-    if done.strange:
-        names = join_names(done.strange, SHOWN)
-        said.append(f"No photo shows these points of the ground: {names}.")
-    if done.lonely and done.usable:
-        names = join_names(done.lonely, SHOWN)
-        said.append(
-            f"{len(done.lonely)} points are on one photo only, or lost the places that "
-            f"determined them, and have no coordinates: {names}."
-        )
-    if done.approximate:
-        said.append(
-            f"{done.approximate} approximate points are not used: no approximate values "
-            "are needed."
-        )
-    return said
-
-
-def _of_pairs(done: Done) -> list[str]:
-    failed = np.flatnonzero(~done.oriented.usable)
-    if not failed.size:
-        return []
-    names = join_names([done.pairs[k] for k in failed], SHOWN)
-    return [
-        f"{len(failed)} pairs could not be oriented by themselves and served as places "
-        f"of points only: {names}. jaxro clean tells why."
-    ]
-
-
-def _of_photos(done: Done) -> list[str]:
-    """Photos that came in twice, and those that one point holds."""
-    said = [
-        f"Photos {one} and {other} show their points at the same places: one photo under "
-        "two names, whose places are no second measurements."
-        for one, other in find_copies(done.adjusted.block)
-    ]
-    if not done.usable:
-        return said
-    return said + [
-        f"The scale of photo {held.photo} rests on point {held.point} alone, and nothing "
-        "checks it: measure more points that three photos show."
-        for held in done.held[:SHOWN]
-    ]
-
-
-def doubts(done: Done) -> list[str]:
-    """What sigma0 and the check points say against a usable block."""
-    return _of_fit(done) + (_beyond(done) if done.checks.names else [])
-
-
-def _of_fit(done: Done) -> list[str]:
-    freedom, sigma0 = done.adjusted.degrees_of_freedom, done.adjusted.sigma0
-    if freedom == 0 or done.chance >= DOUBTFUL:
-        return []
-    if sigma0 > 1:
-        return [
-            f"The residuals are {sigma0:.2f} times as large as the standard deviations "
-            f"say (probability {done.chance:.1g}): these are too small, or the camera is "
-            "not what was given."
-        ]
-    return [
-        f"The residuals are {1 / sigma0:.2f} times smaller than the standard deviations "
-        f"say (probability {done.chance:.1g}): these are too large."
-    ]
-
-
-def _of_control(done: Done) -> list[str]:
-    if done.ground is None:
-        scale = " and scale" if done.bars is None else ""
-        return [
-            f"Without known points the block has any position{scale}; standard "
-            "deviations refer to its stations as a whole (inner constraints)."
-        ]
-    used = done.control.known & ~done.wrong_control
-    poorly = used & (done.control_redundancy < POORLY)
-    if not np.any(poorly):
-        return []
-    named = [
-        f"{AXES[axis]} of {done.control.names[k]}" for k, axis in np.argwhere(poorly)
-    ]
-    return [
-        f"Poorly checked (redundancy below {POORLY}), an error there hardly shows: "
-        f"{join_names(named, SHOWN)}. Each moves the block; more control beside them "
-        "would check them."
-    ]
-
-
-def _of_checks(done: Done) -> list[str]:
-    if done.ground is None:
-        return []
-    if not done.checks.names:
-        return [
-            "No check points: the residuals say how well photos and control fit "
-            "together, not how accurate new points are. Give some points of the ground "
-            "the role check."
-        ]
-    return _beyond(done)
-
-
-def _beyond(done: Done) -> list[str]:
-    """The check points that differ by too much."""
-    sizes, limit = np.abs(done.checks.w), done.limit_of_checks
-    beyond = np.flatnonzero(np.max(sizes, axis=1) > limit)
-    if not beyond.size:
-        return []
-    names = join_names([done.checks.names[k] for k in beyond], SHOWN)
-    return [
-        f"Check points differ by more than their standard deviations allow: {names}."
-    ]

@@ -78,6 +78,12 @@ def summary(done: Done) -> dict[str, Any]:
 
 
 def _result(done: Done) -> str:
+    """The name of the result, or of what is wrong with what was given as a whole."""
+    cause = done.oriented.cause
+    if cause is not None and not cause.is_hint:
+        return cause.name
+    if done.contradictions:
+        return "contradicts"
     names = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
     return str(names[int(done.adjusted.result._value)])
 

@@ -69,7 +69,9 @@ class Done:
         """Whether the numbers may be used."""
         settled = self.oriented.wrong.settled
         found = bool(self.adjusted.result == RESULTS.successful) and settled
-        return found and self.oriented.cause is None and not self.contradictions
+        cause = self.oriented.cause
+        right = cause is None or cause.is_hint
+        return found and right and not self.contradictions
 
     @property
     def contradictions(self) -> tuple[str, ...]:

@@ -10,7 +10,11 @@ from jaxro.block.adjust_chained import adjust_chained
 from jaxro.block.bars import bars
 from jaxro.block.columns import alter
 from jaxro.block.contest import is_misplaced
-from jaxro.block.contradictions import contradictions, is_suspicious
+from jaxro.block.contradictions import (
+    contradictions,
+    is_suspicious,
+    stands_under_ground,
+)
 from jaxro.block.orient_block import adjust_and_judge
 from jaxro.block.photos import find_copies, find_held
 from jaxro.block.wrong_points import decide
@@ -20,9 +24,10 @@ PLACE = np.array([435_000.0, 4_566_000.0, 0.0])
 """Where the block lies."""
 
 
-def strip(seed=3, stations=False):
+def strip(seed=3, stations=False, relief=60.0):
     """A strip with its control, and its stations, on the ground."""
-    mock = block.mock_block(seed, block.Flight(models=6), control_every=2)
+    flight = block.Flight(models=6, relief=relief)
+    mock = block.mock_block(seed, flight, control_every=2)
     names, at = list(mock.ground.points), mock.ground.coordinates + PLACE
     sigma, of_stations = mock.ground.sigma, np.zeros(len(names), bool)
     if stations:
@@ -68,6 +73,33 @@ def test_columns_of_control_are_named(name, change):
     mock, given = strip()
     cause = cause_of(mock, with_coordinates(given, change))
     assert cause is not None and cause.name == name
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("mirrored", lambda at: at[:, [1, 0, 2]]),
+        ("heights_in_feet", lambda at: at / [1, 1, FOOT]),
+    ],
+)
+def test_columns_of_flat_control_are_named_though_most_of_it_fits(name, change):
+    """Heights within some metres: a strip bends until hardly a known point stands out."""
+    mock, given = strip(relief=0.0)
+    cause = cause_of(mock, with_coordinates(given, change))
+    assert cause is not None and cause.name == name
+
+
+def test_photos_under_the_ground_are_told():
+    """Control in a plane fits the mirror image as well."""
+    mock, given = strip()
+    at = given.ground.coordinates * [1, 1, 0]
+    rough = given.ground.sigma * [1, 1, 1e4]
+    flat = given._replace(ground=given.ground._replace(coordinates=at, sigma=rough))
+    above = adjust_chained(flat, mock.photos).adjusted
+    turned = adjust_chained(
+        with_coordinates(flat, lambda at: at[:, [1, 0, 2]]), mock.photos
+    ).adjusted
+    assert not stands_under_ground(above) and stands_under_ground(turned)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import numpy as np
 
 from .. import block as report
 from ..block_model import Done
+from ..block_sentences import doubts, sentences
 from ..control import AXES
 from ..pair import digits
 from ..rows import most_rows
@@ -61,13 +62,13 @@ def page_of_block(done: Done, settings: Sequence[tuple[str, str]]) -> Page:
             Section("How each figure is computed", [Facts(MEANINGS)]),
         ]
     verdict = as_prose(report.verdict(done), markup=True)
-    if done.usable and report.doubts(done):
+    if done.usable and doubts(done):
         verdict = replace(verdict, tone=Tone.mind)
     return Page(
         title=f"Block of {done.title}",
         about=report.contents_in_words(done),
         verdict=verdict,
-        mind=report.sentences(done),
+        mind=sentences(done),
         sections=sections,
         settings=settings,
     )
