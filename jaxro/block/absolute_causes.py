@@ -4,6 +4,7 @@ under which the model is placed anew."""
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from .absolute import orient_model
 from .absolute_model import MeasuredModel
@@ -14,6 +15,10 @@ from .columns import LEVEL, UNCERTAIN, Altered, Cause, alter, falls
 FITS = 0.01
 """sigma0 over the extent of the control below which a model fits that did not fit at all
 before."""
+
+FITS_WELL = 2e-4
+"""Root mean square residual over the extent of the control below which no column is
+wrong: no hypothesis is tried then, which would be seven more adjustments."""
 
 LEAST_FREEDOM = 2
 """Degrees of freedom under a cause."""
@@ -29,16 +34,27 @@ def find_cause(measured: MeasuredModel, found: AbsoluteOrientation) -> Cause | N
     if not np.any(known):
         return None
     at = np.where(known, np.asarray(measured.ground), np.nan)
+    size = float(np.sqrt(np.mean(np.asarray(found.residuals)[known] ** 2)))
+    if bool(found.usable) and size < FITS_WELL * _extent(at):
+        return None
     tried = alter(at, np.any(known, axis=1), "control points")
     if not tried:
         return None
-    extent = float(np.max(np.nanmax(at, axis=0) - np.nanmin(at, axis=0)))
+    extent = _extent(at)
     best, cause = np.inf, None
     for one in tried:
         sigma0 = _compare(measured, found, one, extent, len(tried))
         if sigma0 < best:
             best, cause = sigma0, Cause(one.name, one.sentence)
     return cause
+
+
+def _extent(at: Float[np.ndarray, "point 3"]) -> float:
+    """The largest difference of known coordinates of one axis."""
+    there = np.isfinite(at)
+    largest = np.max(np.where(there, at, -np.inf), axis=0)
+    least = np.min(np.where(there, at, np.inf), axis=0)
+    return float(np.max(np.where(np.any(there, axis=0), largest - least, 0.0)))
 
 
 def _compare(

@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxro import block
+from jaxro.block import absolute_causes
 from jaxro.block.adjust_chained import adjust_chained
 from jaxro.block.bars import bars
 from jaxro.block.columns import alter
@@ -257,3 +259,32 @@ def test_a_photo_under_two_names_and_one_that_a_point_holds_are_told():
     used[first[1:]] = False
     (held,) = find_held(measured, used, *none)
     assert held == (measured.photos[0], measured.points[measured.point[first[0]]])
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        (None, lambda at: at),
+        ("heights_in_feet", lambda at: at / [1, 1, FOOT]),
+        ("heights_equal", lambda at: at * [1, 1, 0]),
+        ("degrees", in_degrees),
+        ("rows_shifted", lambda at: np.roll(at, 1, axis=0)),
+    ],
+)
+def test_columns_of_the_control_of_a_model_are_named(name, change):
+    """One model, turned and scaled; of good control, and of one wrong point, no cause is
+    named."""
+    rng = np.random.default_rng(5)
+    at = PLACE + rng.uniform(0, 1, (9, 3)) * [1500, 1000, 80]
+    turn = Rotation.from_euler("zyx", [0.4, 0.02, -0.03]).as_matrix()
+    inside = (at - at.mean(axis=0)) @ turn.T / 900
+    given = change(at + rng.normal(0, 0.03, at.shape))
+    measured = block.model(inside, given)
+    cause = absolute_causes.find_cause(measured, block.orient_model(measured))
+    assert (cause and cause.name) == name
+    if name is None:
+        given[2, 0] += 40
+        measured = block.model(inside, given)
+        assert (
+            absolute_causes.find_cause(measured, block.orient_model(measured)) is None
+        )
