@@ -66,12 +66,14 @@ class Unjoined(ValueError):
 
 
 class Oriented(NamedTuple):
-    """What is read of oriented pairs: pose, cofactors of its five elements, and whether
-    they may be used; arrays have a pair axis."""
+    """What is read of oriented pairs: pose, cofactors of its five elements, whether they
+    may be used, and how many of their points were kept; arrays have a pair axis."""
 
     pose: RelativePose
     cofactor: Float[Array, "*pair 5 5"]
     usable: Bool[Array, "*pair"]
+    kept: Int[Array, "*pair"]
+    points: Int[Array, "*pair"]
 
 
 def models_of(

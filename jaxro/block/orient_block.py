@@ -1,12 +1,14 @@
 """From pairs in any order to an adjusted block."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
 from ..batches.ragged import Ragged, clean_ragged
+from ..geometry.pairs import Pair
 from ..orientation.axes import tell_field
 from ..rejection import Recommended, Rejection
 from .adjust import BlockAdjustment
@@ -20,6 +22,7 @@ from .contradictions import contradictions, is_suspicious, stands_under_ground
 from .given import Given, Wrong
 from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, from_pairs
+from .moved_names import find_moved
 from .place import Placed, TooLittleControl
 
 
@@ -72,10 +75,11 @@ def orient_block(
     block = from_pairs(left, right, pairs, points) if more is None else more
     if bars is not None and not np.any(bars.are_in(block)):
         raise NoBar("orient_block: no bar has both of its points in the block")
-    chained, usable = chain_pairs(block, left, right, pairs)
-    given = Given(block, ground, inner, bars)
-    judged = adjust_and_judge(given, chained, level, components, sigma_known)
-    return OrientedBlock(*judged.outcome, usable, judged.contradictions, judged.cause)
+    joined = join_pairs(block, left, right, pairs)
+    given = Given(joined.block, ground, inner, bars)
+    judged = adjust_and_judge(given, joined.chained, level, components, sigma_known)
+    cause = joined.cause or judged.cause
+    return OrientedBlock(*judged.outcome, joined.usable, judged.contradictions, cause)
 
 
 class Judged(NamedTuple):
@@ -142,22 +146,44 @@ def _of_field(given: Given) -> Cause | None:
     return Cause("out_of_field", told[0].upper() + told[1:].rstrip(".?"))
 
 
-def chain_pairs(
+class Joined(NamedTuple):
+    """The photos of a block chained by their pairs, which of these could be oriented,
+    and what is wrong with the names of a photo: the block then has the right ones."""
+
+    block: MeasuredBlock
+    chained: Chained
+    usable: Bool[np.ndarray, " pair"]
+    cause: Cause | None = None
+
+
+def join_pairs(
     block: MeasuredBlock, left: Sequence[str], right: Sequence[str], pairs: Ragged
-) -> tuple[Chained, Bool[np.ndarray, " pair"]]:
-    """The photos of a block, chained by their pairs without wrong points, and which of
-    the pairs could be oriented. Raises `Unjoined`."""
+) -> Joined:
+    """The photos of a block, chained by their pairs without wrong points. Raises
+    `Unjoined`."""
     number = {name: k for k, name in enumerate(block.photos)}
-    oriented = Oriented(*clean_ragged(pairs, Recommended(), read=_read)[0])
-    models = models_of(
-        np.array([number[name] for name in left]),
-        np.array([number[name] for name in right]),
-        oriented,
-    )
-    return chain(block, models), np.asarray(oriented.usable)
+    ends = [np.array([number[name] for name in side], int) for side in (left, right)]
+    oriented, cause = _orient(pairs), None
+    moved = find_moved(block, *ends, oriented, _orient)
+    if moved is not None:
+        block, oriented = moved.block, moved.oriented
+        cause = Cause(
+            "names_moved",
+            f"On photo {moved.photo} each place has the name of the row before or after "
+            f"it: moved by one row {moved.fitting} of the {moved.points} points of its "
+            "pairs fit",
+        )
+    chained = chain(block, models_of(*ends, oriented))
+    return Joined(block, chained, np.asarray(oriented.usable), cause)
 
 
-def _read(_: Any, rejection: Rejection) -> tuple[tuple, tuple]:
+def _orient(pairs: Ragged) -> Oriented:
+    """The pairs oriented without their wrong points."""
+    return Oriented(*clean_ragged(pairs, Recommended(), read=_read)[0])
+
+
+def _read(pair: Pair, rejection: Rejection) -> tuple[tuple, tuple]:
     """The `Oriented` of a pair, and nothing of its points."""
     found = rejection.orientation
-    return (found.pose, found.cofactor, found.usable), ()
+    kept, points = jnp.sum(rejection.mask, axis=-1), jnp.sum(pair.mask, axis=-1)
+    return (found.pose, found.cofactor, found.usable, kept, points), ()

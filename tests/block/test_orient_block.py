@@ -313,3 +313,18 @@ def test_swapped_names_in_a_hundred_blocks():
         placed = block.place(measured, chained, ground)
         hits += np.flatnonzero(placed.wrong).tolist() == sorted((i, j))
     assert hits >= 95
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_names_moved_by_one_row_on_a_photo_are_named(step):
+    """Each place of a photo has the name of the row before, or of the next one."""
+    mock = block.mock_block(5, block.Flight(models=4), control_every=2)
+    given, point = mock.block, mock.block.point.copy()
+    own = np.flatnonzero(given.photo == 2)
+    own = own[np.argsort([given.points[k] for k in point[own]])]
+    point[own] = np.roll(point[own], step)
+    found = orient_block(*block.pairs_of(given._replace(point=point)), mock.ground)
+    assert found.cause is not None and found.cause.name == "names_moved"
+    assert given.photos[2] in found.cause.sentence
+    adjusted = found.adjusted
+    assert adjusted.result == RESULTS.successful and not np.any(found.wrong.rays[own])

@@ -1,0 +1,144 @@
+"""A photo on which each place has the name of the row before or after it.
+
+Such a photo fits no other one, and no place of it is worse than the rest. Under each
+hypothesis, the names moved by one row of the list in which they came, or of the list by name, the
+pairs of the photo are oriented anew: where nearly all of their points fit then, and few
+did before, the names are the cause. Of places in a list of no order nothing is found.
+"""
+
+import re
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Int, Shaped
+
+from ..batches.ragged import Ragged
+from .chain import Oriented
+from .measured_block import MeasuredBlock
+
+FEW = 0.5
+"""Part of the points of a photo's pairs up to which its names may be wrong."""
+
+NEARLY_ALL = 0.8
+"""Part of them that has to fit when the names are moved."""
+
+FEWEST = 8
+"""Points of its pairs that can tell."""
+
+TRIED = 2
+"""Photos that are tried."""
+
+
+class Moved(NamedTuple):
+    """A photo whose names are moved: the block with its right names, all pairs oriented
+    with them, and how many of the points of its pairs fit."""
+
+    photo: str
+    block: MeasuredBlock
+    oriented: Oriented
+    fitting: int
+    points: int
+
+
+def find_moved(
+    block: MeasuredBlock,
+    left: Int[np.ndarray, " pair"],
+    right: Int[np.ndarray, " pair"],
+    oriented: Oriented,
+    orient: Callable[[Ragged], Oriented],
+) -> Moved | None:
+    """The photo whose names are moved by one row, None where there is none. `left`,
+    `right`: the photos of the pairs, whose names are `block`'s; `orient`: how pairs are
+    oriented."""
+    for photo in _suspects(len(block.photos), left, right, oriented):
+        own = np.flatnonzero((left == photo) | (right == photo))
+        for names in _moved(block, photo):
+            moved = block._replace(point=names)
+            ends = zip(left[own].tolist(), right[own].tolist(), strict=True)
+            rows = [_common(moved, one, other) for one, other in ends]
+            points = sum(map(len, rows))
+            found = orient(_pairs(moved, left[own], right[own], rows))
+            fitting = int(np.sum(np.where(found.usable, found.kept, 0)))
+            if points >= FEWEST and fitting > NEARLY_ALL * points:
+                every = _replace(oriented, own, found)
+                return Moved(block.photos[photo], moved, every, fitting, points)
+    return None
+
+
+def _suspects(
+    photos: int,
+    left: Int[np.ndarray, " pair"],
+    right: Int[np.ndarray, " pair"],
+    oriented: Oriented,
+) -> list[int]:
+    """The photos in whose pairs few points fit, the worst first."""
+    points = np.asarray(oriented.points, float)
+    fitting = np.where(oriented.usable, oriented.kept, 0.0)
+    of_photo = lambda a: np.bincount(left, a, photos) + np.bincount(right, a, photos)
+    with np.errstate(invalid="ignore"):
+        part = of_photo(fitting) / of_photo(points)
+    worst = np.argsort(part, kind="stable")[:TRIED]
+    return worst[part[worst] <= FEW].tolist()
+
+
+def _moved(block: MeasuredBlock, photo: int) -> list[Int[np.ndarray, " ray"]]:
+    """The points of all rays with those of a photo moved by a row, in either direction,
+    in the order in which they came and in that of their names."""
+    own = np.flatnonzero(block.photo == photo)
+    natural = lambda k: [
+        (int(part) if part.isdigit() else 0, part)
+        for part in re.split(r"(\d+)", block.points[block.point[k]])
+    ]
+    found = []
+    for rows in (own, np.array(sorted(own, key=natural), int)):
+        for step in (1, -1):
+            point = block.point.copy()
+            point[rows] = np.roll(block.point[rows], step)
+            found.append(point)
+    return found
+
+
+def _common(block: MeasuredBlock, one: int, other: int) -> Int[np.ndarray, "row 2"]:
+    """The rays of two photos that show the same points."""
+    rays = [np.flatnonzero(block.photo == photo) for photo in (one, other)]
+    points = [block.point[own] for own in rays]
+    _, *places = np.intersect1d(*points, return_indices=True)
+    return np.stack([own[k] for own, k in zip(rays, places, strict=True)], axis=1)
+
+
+def _pairs(
+    block: MeasuredBlock,
+    left: Int[np.ndarray, " pair"],
+    right: Int[np.ndarray, " pair"],
+    rows: list[Int[np.ndarray, "_ 2"]],
+) -> Ragged:
+    """The pairs of these rays."""
+    one, other = np.concatenate(rows).T
+    return Ragged(
+        begins=np.cumsum([0, *map(len, rows)]),
+        x_left=block.x[one],
+        y_left=block.y[one],
+        x_right=block.x[other],
+        y_right=block.y[other],
+        sigma=np.maximum(block.sigma[one], block.sigma[other]),
+        mask=np.ones(len(one), bool),
+        focal_left=block.focal[left],
+        focal_right=block.focal[right],
+    )
+
+
+def _replace(
+    oriented: Oriented, own: Int[np.ndarray, " some"], found: Oriented
+) -> Oriented:
+    """The oriented pairs with some of them replaced."""
+
+    def put(
+        before: Shaped[np.ndarray, "pair ..."], after: Shaped[np.ndarray, "some ..."]
+    ) -> Shaped[np.ndarray, "pair ..."]:
+        changed = np.array(before)
+        changed[own] = after
+        return changed
+
+    return jax.tree.map(put, oriented, found)
