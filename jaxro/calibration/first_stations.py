@@ -171,6 +171,7 @@ def _resect(seen: _Seen, rays: Rays, lens: Lens) -> tuple[Station, Float[Array, 
         point_sigma=jnp.zeros((number, 3)),
         mask=seen.use,
         handedness=jnp.ones(()),
+        bad_input=jnp.zeros((), bool),
     )
     known = Known(
         principal=jnp.zeros(2),

@@ -22,7 +22,8 @@ class MeasuredImage(eqx.Module):
     the object. `sigma`: standard deviation of x and of y. `point_sigma`: those of X, Y,
     Z, zero for points without error. Masked points are zeros. `handedness`: 1 where y
     points down when x points to the right (pixels), -1 where it points up (photo
-    coordinates), 0 where the points shall tell.
+    coordinates), 0 where the points shall tell. `bad_input`: whether a point was masked
+    because it is not finite.
     """
 
     places: Places
@@ -31,6 +32,7 @@ class MeasuredImage(eqx.Module):
     point_sigma: Points
     mask: Bool[Array, " point"]
     handedness: Float[Array, ""]
+    bad_input: Bool[Array, ""]
 
 
 def image(
@@ -43,7 +45,8 @@ def image(
     mask: Bool[ArrayLike, " point"] | None = None,
     y_down: bool | None = None,
 ) -> MeasuredImage:
-    """A `MeasuredImage`; points that are not finite are masked.
+    """A `MeasuredImage`. Points that are not finite are masked; where the `mask` given
+    holds them, the calibration ends in `non_finite_input`.
 
     `y_down`: whether y points down when x points to the right, as pixels do; None:
     points that do not lie in a plane tell it, and for a plane object it is taken to be
@@ -78,7 +81,8 @@ def _measure(given: Bool[Array, " point"], *numbers: Array) -> MeasuredImage:
     finite = jnp.all(jnp.isfinite(places), axis=1) & jnp.all(
         jnp.isfinite(points) & jnp.isfinite(deviations), axis=1
     )
-    use = given & finite & jnp.isfinite(sigma) & (sigma > 0)
+    fair = finite & jnp.isfinite(sigma) & (sigma > 0)
+    use = given & fair
     used = lambda a: jnp.where(use[:, None], a, 0.0)
     return MeasuredImage(
         places=used(places),
@@ -87,6 +91,7 @@ def _measure(given: Bool[Array, " point"], *numbers: Array) -> MeasuredImage:
         point_sigma=used(deviations),
         mask=use,
         handedness=handedness,
+        bad_input=jnp.any(given & ~fair),
     )
 
 

@@ -54,14 +54,13 @@ def images(
     """`MeasuredImages`; object points that are not finite are unknown.
 
     `camera`: None if one camera took all images. Raises ValueError for places that are
-    not finite, for numbers that do not exist, and for images and points that resection
-    and intersection in turns do not reach.
+    not finite or have no positive `sigma`, for numbers that do not exist, and for images
+    and points that resection and intersection in turns do not reach.
     """
     places = np.stack([np.asarray(x, float), np.asarray(y, float)], axis=-1)
     image, point = np.asarray(image), np.asarray(point)
     points = np.array(points, float)
-    if not np.all(np.isfinite(places)):
-        raise ValueError("calibration.images: a place is not finite; leave it out")
+    _check_finite(places, np.asarray(sigma, float), image, point)
     if point.size and not (point.min() >= 0 and point.max() < len(points)):
         raise ValueError(
             f"calibration.images: points have the numbers 0 to {len(points) - 1}, got "
@@ -99,6 +98,21 @@ def images(
         cameras=1 if camera is None else int(np.max(np.asarray(camera))) + 1,
         solid=bool(thickness(jnp.asarray(points), jnp.asarray(known)) > NEARLY_FLAT),
     )
+
+
+def _check_finite(
+    places: np.ndarray, sigma: np.ndarray, image: np.ndarray, point: np.ndarray
+) -> None:
+    """Raises ValueError, with the first place that cannot be used, and how many."""
+    sigma = np.broadcast_to(sigma, image.shape)
+    fair = np.isfinite(sigma) & (sigma > 0) & np.all(np.isfinite(places), axis=1)
+    if not np.all(fair):
+        k = int(np.argmin(fair))
+        raise ValueError(
+            f"calibration.images: place {k} (point {point[k]} in image {image[k]}) is "
+            f"x = {places[k, 0]:g}, y = {places[k, 1]:g}, sigma = {sigma[k]:g}; leave it "
+            f"out (places like it: {np.sum(~fair)})"
+        )
 
 
 def _rows(image: np.ndarray, number: int) -> np.ndarray:

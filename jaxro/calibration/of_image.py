@@ -51,6 +51,7 @@ def _places_of(found: Together, camera: Int[Array, ""]) -> MeasuredImage:
         point_sigma=jnp.zeros_like(points),
         mask=mask,
         handedness=own.handedness,
+        bad_input=jnp.zeros((), bool),
     )
 
 

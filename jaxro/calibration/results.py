@@ -8,6 +8,11 @@ from ..adjustment import results
 class RESULTS(results.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """How a calibration ended. Where it is not `is_usable`, do not use the numbers."""
 
+    non_finite_input = (
+        "A place, an object point or one of their standard deviations is NaN or "
+        "infinite, or the standard deviation of a place is not positive. The point was "
+        "left out; correct or mask it and calibrate again."
+    )
     no_redundancy = (
         "As many coordinates as unknowns: nothing checks the result, and sigma0 does "
         "not exist. Measure more points, or choose a model with fewer zones."

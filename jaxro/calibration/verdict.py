@@ -37,6 +37,7 @@ def verdict(
     seen = jnp.any(focal != 0, axis=1) & measured.mask[:, None]
     support = jnp.sum(seen, axis=0)
     return _first(
+        (RESULTS.non_finite_input, measured.bad_input),
         (RESULTS.too_few_points, spare < 0),
         (RESULTS.empty_zone, jnp.any(support == 0)),
         (RESULTS.plane_object, flat),

@@ -46,10 +46,6 @@ double it, so that images of different lengths share their programs."""
 SUPPORT = 4
 """Points that a focal length of a zone needs."""
 
-CHOICE = 10
-"""Degrees of freedom that the largest model leaves, from which on the evidence may choose
-without standard deviations: with fewer a large model makes residuals vanish."""
-
 CONTRADICTED = 10.0
 """Ratio of sigma0 to the standard deviations given that is no error of measurement."""
 
@@ -149,11 +145,13 @@ def calibrate(options: Options, task: Task, told: Callable[..., None]) -> Done:
     }
     if task.together:
         photos, compared, points = calibrate_several(options, task)
+        few = len(task.models) > 1 and not compared
         done = Done(
             photos=photos,
             variants=compared,
             points=points,
-            chosen=any(len(rows) > 1 for rows in compared.values()),
+            chosen=bool(compared),
+            few=tuple(named.images) if few else (),
             **common,
         )
     elif options.distances:
@@ -194,21 +192,12 @@ def calibrate_alone(
     rows = task.named.rows_of(image)
     measured = one_image(task, rows, options.y_down, room=_room(task.named))
     check_direction(options, task, measured)
-    models = _testable_models(task, len(rows))
+    models = task.limit_choice(rows)
     with say_what("Comparing models ..."):
         found, compared = calibration.choose(measured, models, task.known)
     sigma = float(np.sqrt(np.mean(task.sigma[rows] ** 2)))
     one = Alone(_photo(task, image, found), compared)
     return one, variants(compared, sigma)
-
-
-def _testable_models(task: Task, points: int) -> tuple[Model, ...]:
-    """The models that an image of so many points can choose among: the simplest one
-    where neither standard deviations nor redundancy would stop a larger one."""
-    largest = max(model.unknowns for model in task.models)
-    if task.sigma_known or 2 * points - largest >= CHOICE:
-        return task.models
-    return task.models[:1]
 
 
 def _photo(task: Task, image: int, found: Calibration) -> Photo:
@@ -274,12 +263,11 @@ def calibrate_several(
         camera=named.camera,
         y_down=True if y_down is None else y_down,
     )
-    model, *others = task.models
+    models = task.limit_choice(np.arange(len(named.image)))
+    model, *others = models
     with say_what("Calibrating all images together ..."):
         if others:
-            found, compared = calibration.choose_together(
-                measured, task.models, task.known
-            )
+            found, compared = calibration.choose_together(measured, models, task.known)
             mean = float(np.sqrt(np.mean(task.sigma**2)))
             tried = {"all images": variants(compared, mean)}
         else:

@@ -3,6 +3,8 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from ..calibration import (
     AbstractZones,
     Brown,
@@ -18,6 +20,7 @@ from ..calibration import (
     strips_along_y,
 )
 from ..tables.fields import TableError
+from ..tables.images import NamedImages
 
 MODELS: dict[str, Callable[[Model], bool]] = {
     "one-f": lambda model: model == Model(),
@@ -37,6 +40,13 @@ ZONES = (
     "borders 0,1,3,4; then optionally :linear, :quadratic or :cubic"
 )
 """How zones are written on the command line."""
+
+CHOICE = 10
+"""Degrees of freedom that the largest model leaves, from which on the evidence may choose
+without standard deviations: with fewer a large model makes residuals vanish."""
+
+OF_STATION = 6
+"""Unknowns of an image beside those of its camera."""
 
 Borders = int | list[float]
 
@@ -71,6 +81,22 @@ def select_models(
     if zones_y is not None:
         change["y"] = parse_zones("--zones-y", zones_y)
     return tuple(dataclasses.replace(m, **change) for m in found)
+
+
+def limit_choice(
+    models: tuple[Model, ...], named: NamedImages, rows: np.ndarray
+) -> tuple[Model, ...]:
+    """The models that the places of these rows, adjusted together, can choose among
+    where their standard deviations are not known: the simplest one where redundancy
+    would not stop a larger one."""
+    images, points = np.unique(named.image[rows]), np.unique(named.point[rows])
+    of_camera = max(model.unknowns for model in models) - OF_STATION
+    unknowns = (
+        OF_STATION * len(images)
+        + of_camera * len(np.unique(named.camera[images]))
+        + 3 * np.count_nonzero(~named.known[points])
+    )
+    return models if 2 * len(rows) - unknowns >= CHOICE else models[:1]
 
 
 def parse_zones(option: str, text: str) -> AbstractZones:

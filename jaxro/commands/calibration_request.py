@@ -12,7 +12,7 @@ from ..tables import images as tables
 from ..tables.examples import calibration as example
 from ..tables.fields import TableError
 from ..tables.images import NamedImages
-from .calibration_models import select_models
+from .calibration_models import limit_choice, select_models
 from .documents import NO_DOCUMENTS, Documents
 
 
@@ -65,6 +65,13 @@ class Task:
     together: bool
     differences: list[tuple[str, str]]
     refocused: bool
+
+    def limit_choice(self, rows: np.ndarray) -> tuple[Model, ...]:
+        """The models that the places of these rows, adjusted together, can choose
+        among."""
+        if self.sigma_known:
+            return self.models
+        return limit_choice(self.models, self.named, rows)
 
 
 def prepare(options: Options) -> Task:

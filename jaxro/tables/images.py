@@ -156,7 +156,8 @@ def _read_coordinates(row: Row) -> None:
             expected="X, Y and Z, or three empty fields for a point that is unknown",
         )
     for axis in AXES:
-        cells[axis] = np.nan if empty else _number(row, axis)
+        advice = "; three empty fields for a point that is unknown"
+        cells[axis] = np.nan if empty else _number(row, axis, advice)
     for column in (*DEVIATIONS, "sigma"):
         if column in cells:
             cells[column] = (

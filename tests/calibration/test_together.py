@@ -167,6 +167,11 @@ def test_what_does_not_hang_together_is_refused():
     few = (image == 0) | (point != 3)
     with pytest.raises(ValueError, match="point 3 is unknown and measured in fewer"):
         calibration.images(*places[few].T, image[few], point[few], once)
+    sigma = np.ones(len(places))
+    sigma[7] = np.nan
+    told = rf"place 7 \(point {point[7]} in image {image[7]}\) .* sigma = nan"
+    with pytest.raises(ValueError, match=told):
+        calibration.images(*places.T, image, point, points, sigma=sigma)
     with pytest.raises(ValueError, match="numbers 0 to 13, got 0 to 14"):
         calibration.images(*places.T, image, point + (point == 13), points)
 
