@@ -1,6 +1,7 @@
 """What makes a pair wrong as a whole, told before its orientation is believed: one photo
 mirrored, a focal length in another unit, an origin in a corner, an absurd sigma0."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -175,16 +176,12 @@ def _find_mirrored(
     """Those of the chosen pairs that fit with their right photo mirrored."""
     some = choose(pairs, chosen, rows_of(pairs, chosen))
     image = mirror(some)
+    if "residuals" in task.tables:
+        before = _found_of(pairs, found, chosen)
+    else:  # which tell what lies behind a photo
+        task = dataclasses.replace(task, tables=(*task.tables, "residuals"))
+        before = solve(some, task, plan)
     again = solve(image, task, plan)
-    of_chosen = lambda a: np.asarray(a)[chosen]
-    rows = np.concatenate(rows_of(pairs, chosen))
-    before = found._replace(
-        of_pairs=jax.tree.map(of_chosen, found.of_pairs),
-        of_points=jax.tree.map(lambda a: np.asarray(a)[rows], found.of_points),
-        outcome=None if found.outcome is None else of_chosen(found.outcome),
-        decided=found.decided
-        and {name: np.asarray(a)[rows] for name, a in found.decided.items()},
-    )
 
     def is_one(k: int) -> bool:
         (left, right), focals = _photos(some, k)
@@ -198,6 +195,19 @@ def _find_mirrored(
         return not axes.lie_in_plane(left[kept], right[kept], noise)
 
     return [int(k) for place, k in enumerate(chosen) if is_one(place)]
+
+
+def _found_of(pairs: Ragged, found: Found, chosen: Int[np.ndarray, " some"]) -> Found:
+    """What is found of the chosen pairs."""
+    of_chosen = lambda a: np.asarray(a)[chosen]
+    rows = np.concatenate(rows_of(pairs, chosen))
+    return found._replace(
+        of_pairs=jax.tree.map(of_chosen, found.of_pairs),
+        of_points=jax.tree.map(lambda a: np.asarray(a)[rows], found.of_points),
+        outcome=None if found.outcome is None else of_chosen(found.outcome),
+        decided=found.decided
+        and {name: np.asarray(a)[rows] for name, a in found.decided.items()},
+    )
 
 
 def mirror(pairs: Ragged) -> Ragged:

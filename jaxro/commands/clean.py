@@ -60,7 +60,7 @@ def run(
         show_json(found | {"orientation": files.summary_of(results, summary)})
         return good
     jobs.show_sigma(console, job)
-    show_causes(console, results)
+    show_causes(console, results.causes_by_name(), results.wrong.size)
     report.show(console, verdicts, name, job.units.photo)
     jobs.show(console, job, results)
     console.print(written, end="", markup=False)

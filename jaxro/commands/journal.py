@@ -24,7 +24,7 @@ from typing import Any
 from ..reports.files import json_text
 from ..tables import whole
 from ..tables.fields import TableError
-from .stream import CONVERTED, Part, Work, Worker, file_digest, part_file
+from .stream import CONVERTED, NAMED, Part, Work, Worker, file_digest, part_file
 
 JOURNAL = "journal.jsonl"
 
@@ -153,8 +153,13 @@ class Job:
             for entry in self.entries:
                 total.update(entry[key])
             told |= {key: dict(sorted(total.items()))} if total else {}
+        causes = [each for entry in self.entries for each in entry["causes"].items()]
         doubles = [name for entry in self.entries for name in entry["doubles"]]
-        return told | {"pairs_with_two_points_of_one_name": doubles}
+        return told | {
+            "pairs_wrong_as_a_whole": sum(entry["wrong"] for entry in self.entries),
+            "causes": dict(causes[:NAMED]),
+            "pairs_with_two_points_of_one_name": doubles,
+        }
 
     def _verify(self) -> None:
         """Raises TableError for a part that the disk has not kept."""

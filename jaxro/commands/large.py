@@ -17,7 +17,7 @@ from ..batches.ragged import Ragged, concatenate
 from ..batches.table_noise import PAIRS
 from ..rejection import AbstractProcedure
 from ..reports.columns import TABLES
-from ..reports.pair import table as terminal_table
+from ..reports.pair import show_causes, table as terminal_table
 from ..reports.terminal import Spent, consoles, progress, say_what, stopwatch
 from ..tables import parquet, whole
 from ..tables.cameras import Cameras
@@ -386,7 +386,9 @@ def _plain(value: Any) -> Any:
 
 
 def show(console: Console, job: Job, summary: dict[str, Any], spent: Spent) -> None:
-    """How the pairs ended, and where the tables are."""
+    """What is wrong with pairs as a whole, how the pairs ended, and where the tables
+    are."""
+    show_causes(console, summary["causes"], summary["pairs_wrong_as_a_whole"])
     for kind, title in (("outcomes", "cleaning"), ("results", "orientation")):
         if kind in summary:
             rows = terminal_table(title, "pairs", "%")

@@ -21,6 +21,7 @@ from ..orientation.model_errors import Derivatives, differentiate, root
 from ..reports.columns import COMMON, OWN
 from ..xla.programs import compiled
 from ..xla.settings import MOMENT, settings_for
+from .solve import Found, Task
 
 
 class Posed(NamedTuple):
@@ -50,6 +51,20 @@ class Differentiator(NamedTuple):
 @compiled(settings=lambda one, **_: settings_for(one.x_left.size, MOMENT))
 def _of_one(posed: Posed, *, of: Differentiator) -> Derivatives:
     return of(posed)
+
+
+def add_model_errors(
+    pairs: Ragged, found: Found, task: Task, plan: Plan | None
+) -> Found:
+    """What is found of the pairs with the `model_errors` of their points, where there are
+    points, of which a least squares orientation tells."""
+    if task.residual != "rigorous" or "points" not in found.of_points:
+        return found
+    points = found.of_points["points"]
+    errors = model_errors(
+        pairs, found.of_pairs, points, task.system, task.sigma_known, plan
+    )
+    return found._replace(of_points=found.of_points | {"points": points | errors})
 
 
 def model_errors(

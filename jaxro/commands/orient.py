@@ -10,7 +10,7 @@ from rich.console import Console
 
 from .. import __version__
 from ..batches import table_neighbours
-from ..batches.padding import Plan, plan_for
+from ..batches.padding import plan_for
 from ..batches.ragged import Ragged
 from ..batches.table_noise import TableNoise
 from ..rejection import AbstractProcedure
@@ -27,7 +27,7 @@ from ..tables.measured import CameraPairs, Table, tell_copies, to_ragged
 from . import neighbours, other_programs, sigma as deviation
 from .causes import name_causes, tell_causes
 from .documents import settings, show_json
-from .model_accuracy import model_errors
+from .model_accuracy import add_model_errors
 from .request import (
     MEASURED,
     SYSTEMS,
@@ -38,7 +38,7 @@ from .request import (
     read_table,
     units_of,
 )
-from .solve import Found, Task, Told, make_results, make_verdicts, solve
+from .solve import Found, Task, Told, in_use, make_results, make_verdicts, solve
 
 
 @dataclass(frozen=True)
@@ -157,10 +157,8 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
     plan = None if job.is_single else plan_for(job.table.lengths)
     found = solve(job.pairs, job.task, plan, told=told)
     found = name_causes(job.pairs, found, job.task, plan)
-    used, verdicts = job.pairs, None
-    if found.decided is not None:
-        used = used._replace(mask=used.mask & found.decided["in_use"])
-        verdicts = make_verdicts(job.table, found)
+    used = in_use(job.pairs, found)
+    verdicts = None if found.decided is None else make_verdicts(job.table, found)
     told_of: dict[str, Any] = {"rotations": find_rotations(used, found.of_pairs)}
     if job.options.residual == "rigorous":
         patterns = find_patterns(used, found.of_pairs)
@@ -172,7 +170,7 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
             told_of["intervals"] = _intervals(job, used, found)
         found = found._replace(of_pairs=of_pairs)
     if job.options.out is not None:
-        found = _with_model_errors(job, used, found, plan)
+        found = add_model_errors(used, found, job.task, plan)
     known, unit = job.task.sigma_known, job.units.photo
     told_of["causes"] = tell_causes(used, found.of_pairs, known, unit)
     results = make_results(
@@ -185,20 +183,6 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
         **told_of,
     )
     return results, verdicts
-
-
-def _with_model_errors(
-    job: Job, used: Ragged, found: Found, plan: Plan | None
-) -> Found:
-    """What is found with the standard deviations of the model points, of which a least
-    squares orientation tells."""
-    if job.options.residual != "rigorous" or "points" not in found.of_points:
-        return found
-    points, task = found.of_points["points"], job.task
-    errors = model_errors(
-        used, found.of_pairs, points, task.system, task.sigma_known, plan
-    )
-    return found._replace(of_points=found.of_points | {"points": points | errors})
 
 
 def _intervals(job: Job, used: Ragged, found: Found) -> dict[int, Any]:
@@ -226,7 +210,7 @@ def run(options: Options) -> bool:
         show_json(files.summary_of(results, summary))
         return bool(results.usable.all())
     show_sigma(console, job)
-    report.show_causes(console, results)
+    report.show_causes(console, results.causes_by_name(), results.wrong.size)
     show(console, job, results)
     console.print(written, end="", markup=False)
     if options.file is None:

@@ -380,6 +380,13 @@ def _part_rounds(
     ]
 
 
+def in_use(pairs: Ragged, found: Found) -> Ragged:
+    """The pairs without the points that were rejected."""
+    if found.decided is None:
+        return pairs
+    return pairs._replace(mask=pairs.mask & found.decided["in_use"])
+
+
 def make_results(
     table: Table,
     cameras: CameraPairs,

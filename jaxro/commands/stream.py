@@ -17,7 +17,9 @@ from ..reports.arrow import arrow_table
 from ..reports.columns import OUTCOME_NAMES, RESULT_NAMES, Units
 from ..tables import cameras as camera_files, parquet, whole
 from ..tables.measured import take, to_list, to_ragged
-from .solve import Task, make_results, make_verdicts, solve
+from .causes import name_causes, tell_causes
+from .model_accuracy import add_model_errors
+from .solve import Task, in_use, make_results, make_verdicts, solve
 
 PART_ROWS = 1 << 19
 """Rows of a part at most: its arrays take some 300 MB."""
@@ -71,8 +73,14 @@ class Worker:
         table = self._source.read(part.begins).with_sigma(work.sigma)
         cameras = work.cameras.of_all(table.names, table.file, photos=table.photos)
         pairs = to_ragged(table, cameras, work.sigma)
-        found = solve(pairs, work.task, work.plan, self._threads, told)
-        results = make_results(table, cameras, found, work.task, work.units)
+        task, plan, units = work.task, work.plan, work.units
+        found = solve(pairs, task, plan, self._threads, told)
+        found = name_causes(pairs, found, task, plan)
+        used = in_use(pairs, found)
+        if "points" in task.tables:
+            found = add_model_errors(used, found, task, plan)
+        causes = tell_causes(used, found.of_pairs, task.sigma_known, units.photo)
+        results = make_results(table, cameras, found, task, units, causes=causes)
         written = {name: results.written(name) for name in work.task.tables}
         outcomes = {}
         if found.outcome is not None:
@@ -85,6 +93,8 @@ class Worker:
             "rows": len(table.points),
             "results": _count(found.of_pairs["result"], RESULT_NAMES),
             "outcomes": outcomes,
+            "wrong": results.wrong.size,
+            "causes": results.causes_by_name(NAMED),
             "doubles": list(map(str, to_list(take(table.names, doubles)))),
             "files": self._write(part.number, written),
         }

@@ -33,6 +33,8 @@ def arrow_column(values: Any, names: Mapping[int, str] | None = None) -> Any:
         return values
     if names:
         return _texts(values, names)
+    if values.dtype.kind == "O":
+        return pa.array(values, pa.string())
     if values.dtype.kind == "f":
         return pa.array(values, from_pandas=bool(np.isnan(values).any()))
     missing = values < 0 if values.dtype.kind == "i" and np.any(values < 0) else None

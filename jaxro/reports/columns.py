@@ -176,6 +176,7 @@ BEHIND_ELEMENTS = (
         names={k: RESULT_ADVICE[name] for k, name in RESULT_NAMES.items()},
         only="csv",
     ),
+    Column("causes"),
     Column("correlation", of=_orientation("correlation"), there="usable", only="no"),
     Column("cofactor", of=_orientation("cofactor"), there="usable", only="no"),
     Column(
@@ -217,7 +218,7 @@ POINTS = (
         for k, axis in enumerate("XYZ")
     ),
     *(
-        Column(name, Kind.MODEL, there="usable", only="csv")
+        Column(name, Kind.MODEL, there="usable")
         for name in ("sX", "sY", "sZ", *OWN, *COMMON)
     ),
 )

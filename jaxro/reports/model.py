@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment import critical_values
 from ..assessment import Pattern, likelihood
@@ -40,6 +40,9 @@ from .columns import (
     is_usable,
 )
 from .reader import report_numbers
+
+WRONG_AS_A_WHOLE = ("mirrored", "out_of_field")
+"""Results that name a cause, which is told first."""
 
 MOST_PAIRS = 100
 """Pairs of a table of which more is told than their elements."""
@@ -99,13 +102,40 @@ class Results:
         """The columns of a table, and their values by name."""
         columns = columns_of(name, self.system)
         if name == "elements":
-            own = {"pair": self.table.names, "points": self.table.lengths}
+            causes = np.full(len(self), None, object)
+            for number, said in self.causes.items():
+                causes[number] = " ".join(said)
+            own = {
+                "pair": self.table.names,
+                "points": self.table.lengths,
+                "causes": causes,
+            }
             return columns, self.of_pairs | own
         own = {
             "pair": take(self.table.names, self.table.owners),
             "point": self.table.points,
         }
         return columns, self.of_points[name] | own
+
+    @cached_property
+    def wrong(self) -> Int[np.ndarray, " some"]:
+        """The pairs with something wrong as a whole."""
+        named = [k for k, name in RESULT_NAMES.items() if name in WRONG_AS_A_WHOLE]
+        found = np.flatnonzero(np.isin(self.of_pairs["result"], named))
+        return np.union1d(found, np.array(list(self.causes), int))
+
+    def causes_by_name(self, most: int | None = None) -> dict[str, list[str]]:
+        """What is to be read first of the pairs that are `wrong`, of the first ones if
+        there are more than `most`."""
+        some = self.wrong[:most]
+        told = {}
+        for number, name in zip(
+            some, to_list(take(self.table.names, some)), strict=True
+        ):
+            result = RESULT_NAMES[int(self.of_pairs["result"][number])]
+            first = [RESULT_ADVICE[result]] if result in WRONG_AS_A_WHOLE else []
+            told[str(name)] = [*first, *self.causes.get(int(number), [])]
+        return told
 
     @cached_property
     def half_widths(self) -> dict[str, Float[np.ndarray, " pair"]]:

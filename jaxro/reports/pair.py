@@ -3,6 +3,7 @@ find, in tables."""
 
 import math
 from collections import defaultdict
+from collections.abc import Mapping
 from typing import Any, SupportsFloat
 
 import numpy as np
@@ -23,20 +24,19 @@ HIGH = 0.95
 CORRECTIONS = tuple(f"v_{name}" for name in COORDINATES)
 AXES = ("X", "Y", "Z")
 
-WRONG_AS_A_WHOLE = ("mirrored", "out_of_field")
-"""Results that name a cause, which is told first."""
 
-
-def show_causes(console: Console, results: Results) -> None:
-    """What is to be read first: of every pair what is wrong with it as a whole."""
-    named = [one for one in results if one.causes or one.result in WRONG_AS_A_WHOLE]
-    for one in named[: most_rows()]:
-        first = [one.advice] if one.result in WRONG_AS_A_WHOLE else []
-        for sentence in (*first, *one.causes):
-            console.print(
-                f"[bold red]{escape(one.name)}[/bold red]: {escape(sentence)}"
-            )
-    left_out(console, len(named), "pairs with something wrong as a whole")
+def show_causes(console: Console, causes: Mapping[str, list[str]], pairs: int) -> None:
+    """What is to be read first: what is wrong with pairs as a whole, by their names, and
+    of how many `pairs` there is such a thing to tell."""
+    shown = list(causes.items())[: most_rows()]
+    for name, sentences in shown:
+        for sentence in sentences:
+            console.print(f"[bold red]{escape(name)}[/bold red]: {escape(sentence)}")
+    if pairs > len(shown):
+        console.print(
+            f"{len(shown)} of {pairs} pairs with something wrong as a whole; the column "
+            "causes of --out DIR tells of all."
+        )
 
 
 def show(console: Console, results: Results, subtitle: str) -> None:

@@ -2,6 +2,7 @@
 the last digit, for one pair, a few, and many, which are worked on in parts."""
 
 import csv
+import json
 import math
 from functools import partial
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from jaxro.commands import large
+from jaxro.tables.measured import COORDINATES
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -17,7 +19,9 @@ pq = pytest.importorskip("pyarrow.parquet")
 FOCAL = 100.0
 COUNTS = {"one": 1, "few": 3, "many": 70}
 TABLES = ("elements", "residuals", "points", "reliability")
-TEXTS = {"pair", "point", "result"}
+TEXTS = {"pair", "point", "result", "causes"}
+ONLY_PARQUET = {"used", "outcome", "kept", "undecided"}
+ONLY_CSV = {"advice", "verdict", *(f"control_{c}" for c in COORDINATES)}
 PART_ROWS = 200
 
 
@@ -31,7 +35,8 @@ def small_parts():
 
 def measure(pairs: int) -> dict[str, list]:
     """Columns of near-vertical pairs of 8 to 12 points with errors of 0.01 mm, every
-    second of them with a wrong point."""
+    second of them with a wrong point. Of pair 2 the right photo is mirrored, of pair 4
+    the origin lies in a corner."""
     rng = np.random.default_rng(7)
     columns: dict[str, list] = {
         name: [] for name in ("pair", "point", "x_left", "y_left", "x_right", "y_right")
@@ -47,6 +52,12 @@ def measure(pairs: int) -> dict[str, list]:
             for p in (ground, right)
         )
         right_image[0, 1] += k % 2
+        if k == 2:
+            right_image[:, 1] *= -1
+        if k == 4:
+            left_image, right_image = (
+                photo - np.min(photo, axis=0) + 1 for photo in (left_image, right_image)
+            )
         columns["pair"] += [f"p{k:03}"] * count
         columns["point"] += [str(i) for i in range(count)]
         for name, values in zip(
@@ -100,7 +111,8 @@ def assert_same(folder, command, table, without=()):
         rows = list(csv.DictReader(file))
     assert len(rows) == found.num_rows
     shared = set(found.column_names) & set(rows[0]) - set(without)
-    assert set(found.column_names) - shared <= {"used", "outcome", "kept", "undecided"}
+    assert set(found.column_names) - shared <= ONLY_PARQUET
+    assert set(rows[0]) - shared <= ONLY_CSV
     if "kept" in found.column_names:
         kept = [row["verdict"] == "kept" for row in rows]
         assert found.column("kept").to_pylist() == kept
@@ -110,7 +122,7 @@ def assert_same(folder, command, table, without=()):
         texts = [row[name] for row in rows]
         for text, value in zip(texts, found.column(name).to_pylist(), strict=True):
             if name in TEXTS:
-                assert text == value
+                assert text == (value or "")
             elif isinstance(value, bool):
                 assert text == str(value).lower()
             elif value is None or (math.isinf(value) and not text):
@@ -123,6 +135,14 @@ def test_oriented_pairs_have_the_same_figures(folder):
     assert len(set(run("orient", folder))) == 1
     for table in TABLES:
         assert_same(folder, "orient", table)
+    pairs = pq.read_table(folder / "orient_parquet" / "elements").to_pylist()
+    told = json.loads((folder / "orient_parquet" / "summary.json").read_text())
+    if len(pairs) > 2:
+        assert pairs[2]["result"] == "mirrored" and "p002" in told["causes"]
+    if len(pairs) > 4:
+        assert "origin" in pairs[4]["causes"]
+    named = [p for p in pairs if p["causes"] or p["result"] == "mirrored"]
+    assert told["pairs_wrong_as_a_whole"] == len(named)
     parts = len(list((folder / "orient_parquet" / "elements").iterdir()))
     assert (parts > 3) == (folder.name.startswith("many"))
 
