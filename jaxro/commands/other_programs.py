@@ -41,8 +41,17 @@ def read(options: Options) -> tuple[Options, Table, Cameras]:
 
 def read_for_block(options: Options) -> tuple[Options, Table, Cameras]:
     """The same for a block, in which a place has one standard deviation: the mean of
-    each point, with a warning."""
+    each point, with a warning. Raises TableError, too, for pairs that nothing joins."""
     options, table, cameras = read(options)
+    photos = [name for side in table.photos or () for name in side]
+    if len(photos) == len(set(photos)) > 2:
+        raise TableError(
+            table.file,
+            found=f"{len(table.names)} pairs with photos and points of their own, as "
+            "HDF5 files have them",
+            expected="one pair; or a file that says which photos and points of two pairs "
+            "are one: a table with left, right and point, or a model of COLMAP",
+        )
     return options, table.with_one_sigma(), cameras
 
 

@@ -12,6 +12,8 @@ import pixel_scene as scene
 import pytest
 
 from jaxro import exchange
+from jaxro.commands.block_request import Options, prepare
+from jaxro.commands.request import Options as Measured
 from jaxro.reports.files import columns_text
 from jaxro.tables import cameras
 
@@ -187,6 +189,74 @@ def test_parquet_results_of_another_program_are_its_csv_results(kind, inputs, tm
     for name in ("bx", "sd_bx", "omega_deg", "sd_omega_deg", "sigma0"):
         numbers = [float(row[name]) for row in expected]
         np.testing.assert_allclose([row[name] for row in found], numbers, rtol=1e-9)
+
+
+SEPARATORS = {"tabs.csv": "\t", "semicolons.csv": ";"}
+
+
+@pytest.fixture(scope="module")
+def blocks(inputs):
+    """The inputs that hold a block, and its table with other separators."""
+    blocks = {kind: words for kind, words in inputs.items() if kind != "pairs.h5"}
+    table, *given = inputs["pairs.csv"]
+    for kind, separator in SEPARATORS.items():
+        other = table.with_name(kind)
+        other.write_text(table.read_text().replace(",", separator))
+        blocks[kind] = [other, *given]
+    return blocks
+
+
+def ground_of(kind, folder):
+    """A table of control, with the names that a file gives its points."""
+    first = 0 if kind == "bundle.out" else 1
+    lines = [
+        f"{first + k},{x!r},{y!r},{z!r},0.001,{'check' if k >= 8 else ''}"
+        for k, (x, y, z) in enumerate(scene.points(COUNT).tolist())
+    ]
+    path = folder / "ground.csv"
+    path.write_text("\n".join(["point,X,Y,Z,sigma,role", *lines]))
+    return path
+
+
+@pytest.mark.parametrize(
+    "kind", [*(kind for kind in INPUTS if kind != "pairs.h5"), *SEPARATORS]
+)
+def test_a_block_is_the_same_from_every_input(kind, blocks, tmp_path):
+    """Photos, points and control find each other, and the places are those of the
+    scene."""
+    path, *_, value = blocks[kind]
+    given = {"camera": path.with_name("cameras.toml"), "unit": value}
+    if "pairs" not in kind and kind not in SEPARATORS:
+        given = {"sigma": str(value)}
+    measured = Measured(file=path, **given)
+    task, _ = prepare(Options(measured=measured, control=ground_of(kind, tmp_path)))
+    block, ground = task.more, task.ground
+    assert len(block.photos) == 3 and len(block.photo) == 3 * COUNT
+    assert sorted(ground.points) == sorted(block.points) and sum(ground.check) == 6
+    for number in range(3):
+        rows = np.flatnonzero(block.photo == number)
+        names = [
+            int(block.points[k]) - (kind != "bundle.out") for k in block.point[rows]
+        ]
+        expected = (pixels_of(number) - K[:2, 2]) / K[[0, 1], [0, 1]] * [1, -1]
+        seen = np.stack([block.x, block.y], axis=1)[rows] / block.focal[number]
+        np.testing.assert_allclose(seen, expected[names], atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["bundle.out", "binary", "semicolons.csv"])
+def test_a_block_of_every_input_is_true(kind, blocks, tmp_path):
+    out = tmp_path / "out"
+    control = "--control", ground_of(kind, tmp_path)
+    done = command_line.run("block", *blocks[kind], *control, "--out", out)
+    assert done.exit_code == 0, done.output
+    told = json.loads((out / "summary.json").read_text())
+    assert told["check_points"] == 6 and 0.6 < told["sigma0"] < 1.4
+
+
+def test_pairs_that_nothing_joins_are_no_block(inputs):
+    done = command_line.run("block", *inputs["pairs.h5"])
+    assert done.exit_code == 2 and "photos and points of their own" in done.stderr
 
 
 def test_rejected_points_of_a_table_are_left_out(tmp_path):
