@@ -10,7 +10,7 @@ from ..reports import block as report, block_comparisons as comparisons, block_p
 from ..reports.block_files import contents, summary
 from ..reports.block_model import Done
 from ..reports.html.block import page_of_block
-from ..reports.terminal import consoles, say_what
+from ..reports.terminal import consoles, say_what, warn
 from ..tables import (
     whole,
 )
@@ -33,7 +33,7 @@ def run(options: Options) -> bool:
     with documents.claimed(place, force=force, read=options.read):
         task, made = prepare(options)
         for warning in task.warnings:
-            errors.print(f"Warning: {warning}", style="yellow", markup=False)
+            warn(errors, warning)
         done = calculate(task, options)
         if out is not None:
             picture, why = _picture(done)

@@ -26,7 +26,7 @@ from ..reports.calibration_model import (
     zone_names,
 )
 from ..reports.html.calibration import page_of_calibration
-from ..reports.terminal import consoles, progress, say_what
+from ..reports.terminal import consoles, progress, say_what, warn
 from ..tables import whole
 from ..tables.examples import calibration as example
 from ..tables.fields import TableError
@@ -78,7 +78,7 @@ def run(options: Options) -> bool:
         return done.usable
     report.show(console, done)
     for warning in warnings:
-        errors.print(f"Warning: {warning}", style="yellow", markup=False)
+        warn(errors, warning)
     if texts:
         console.print(f"Written to {options.out}: {', '.join(texts)}", markup=False)
     console.print(written, end="", markup=False)

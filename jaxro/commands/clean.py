@@ -30,7 +30,7 @@ def run(
     with jobs.writing(options) as write:
         job = jobs.prepare(options, SIMULATED, procedure)
         check_sigma(name, procedure, job.task.sigma_known)
-        jobs.warn(errors, job)
+        jobs.warn_of_table(errors, job)
         with progress(errors, "Cleaning", len(job.table.names)) as told:
             results, verdicts = jobs.solve_table(job, told)
         assert verdicts is not None

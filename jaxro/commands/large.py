@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
 from .. import __version__
 from ..batches.padding import plan_for
@@ -19,6 +18,7 @@ from ..rejection import AbstractProcedure
 from ..reports.columns import TABLES
 from ..reports.pair import show_causes, table as terminal_table
 from ..reports.terminal import Spent, consoles, progress, say_what, stopwatch
+from ..reports.text import escape
 from ..tables import parquet, whole
 from ..tables.cameras import Cameras
 from ..tables.conversion import convert

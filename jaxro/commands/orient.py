@@ -18,7 +18,7 @@ from ..reports import files, pair as report, reliability
 from ..reports.columns import TABLES, Units
 from ..reports.html.pairs import Cleaned, page_of_pairs
 from ..reports.model import Results, find_intervals, find_patterns, find_rotations
-from ..reports.terminal import consoles, progress, say_what
+from ..reports.terminal import consoles, progress, say_what, warn
 from ..reports.verdicts import Verdicts
 from ..tables import csv as tables, whole
 from ..tables.cameras import Cameras
@@ -199,7 +199,7 @@ def run(options: Options) -> bool:
     console, errors = consoles()
     with writing(options) as write:
         job = prepare(options)
-        warn(errors, job)
+        warn_of_table(errors, job)
         with progress(errors, "Orienting", len(job.table.names)) as told:
             results, _ = solve_table(job, told)
         summary = job.summary(results)
@@ -222,10 +222,10 @@ def run(options: Options) -> bool:
     return bool(results.usable.all())
 
 
-def warn(errors: Console, job: Job) -> None:
+def warn_of_table(errors: Console, job: Job) -> None:
     """What a careful reader of the table should be told."""
     for warning in job.table.warnings:
-        errors.print(f"Warning: {warning}", style="yellow", markup=False)
+        warn(errors, warning)
 
 
 Texts = Callable[[], dict[str, str]]

@@ -135,7 +135,7 @@ def layouts_of(options: Options, warnings: Any) -> dict[str, Pair]:
     if options.file is None:
         return _standard(options)
     job = jobs.prepare(options)
-    jobs.warn(warnings, job)
+    jobs.warn_of_table(warnings, job)
     measured, pair = job.table.pairs[0], one_pair(job.pairs, 0)
     solved = orient(pair)
     if not bool(solved.usable):

@@ -2,7 +2,6 @@
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
 from ..adjustment import critical_values as critical
 from ..block.absolute_result import NAMES
@@ -12,7 +11,7 @@ from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
 from .pair import digits, join_names, table
 from .reliability import DOUBTFUL
 from .rows import left_out
-from .text import number
+from .text import escape, number, say
 
 POORLY = 0.1
 """Redundancy below which a control coordinate is said to be poorly checked."""
@@ -32,7 +31,7 @@ def show(console: Console, done: Done) -> None:
     _head(console, done)
     console.print(_verdict(done))
     if done.usable:
-        console.print(accuracy(done), markup=False)
+        say(console, accuracy(done))
         _elements(console, done)
         _control(console, done)
         show_checks(console, done.checks, "model", done.unit, done.limit_of_checks)
@@ -154,11 +153,11 @@ def _points(console: Console, done: Done) -> None:
     rms = [number(a, digits(a, 1)) for a in np.sqrt(np.mean(deviations**2, axis=0))]
     k = int(np.argmax(np.max(deviations, axis=1)))
     most = float(np.max(deviations[k]))
-    console.print(
+    say(
+        console,
         f"{len(done.model.names)} points: standard deviations X {rms[0]}, Y {rms[1]}, Z "
         f"{rms[2]} {done.unit} (root mean square), the weakest of {done.model.names[k]} "
         f"with {number(most, digits(most, 1))}",
-        markup=False,
     )
 
 

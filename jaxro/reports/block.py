@@ -3,16 +3,16 @@ accuracy on the ground."""
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
 from ..adjustment import RESULTS
+from ..tables.fields import tell
 from .block_files import ANGLES
 from .block_model import Done
 from .block_sentences import SHOWN, sentences
 from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
 from .pair import digits, table
 from .rows import left_out, most_rows, worst
-from .text import number
+from .text import escape, number
 
 CONTRADICTED = (
     " So much is no single error, and no cause that was tried explains it: look at names, "
@@ -223,7 +223,7 @@ def _accuracy(done: Done) -> str:
     name = done.adjusted.block.points[there[k]]
     return (
         f"Accuracy: standard deviations of the points X {rms[0]}, Y {rms[1]}, Z "
-        f"{rms[2]} {done.unit} (root mean square), the weakest of {name} with "
+        f"{rms[2]} {done.unit} (root mean square), the weakest of {tell(name)} with "
         f"{number(most, digits(most, 1))}{_hidden(done)}"
     )
 
@@ -240,7 +240,7 @@ def _hidden(done: Done) -> str:
         name = block.points[block.point[k]]
         text = (
             "\nAn error of a place that is found in 80 % of cases moves its point by up "
-            f"to {number(largest[k], digits(largest[k], 1))} {done.unit} ({name})"
+            f"to {number(largest[k], digits(largest[k], 1))} {done.unit} ({tell(name)})"
         )
     if number_unchecked := int(np.sum(checked.unchecked & used)):
         text += f"; {number_unchecked} coordinates of places are checked by nothing"

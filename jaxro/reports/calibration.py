@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from ..calibration.results import RESULTS
@@ -25,7 +24,7 @@ from .calibration_words import (
 )
 from .pair import digits, join_names, table
 from .rows import left_out, some_rows, worst
-from .text import number
+from .text import escape, number, say
 
 AXES = ("X", "Y", "Z")
 ANGLES = ("omega", "phi", "kappa")
@@ -122,12 +121,12 @@ def show_tests(console: Console, done: Done) -> None:
     for one in usable[:1] if done.together else usable:
         if said := zones_in_words(done, one):
             of = f"{one.name}: " if len(done.photos) > 1 and not done.together else ""
-            console.print(f"{of}{said}", markup=False)
+            say(console, f"{of}{said}")
     for both in done.differences:
         verdict, *rest = difference_in_words(done, both)
         console.print(f"[green]{escape(verdict)}[/green]")
         for text in rest:
-            console.print(text, markup=False)
+            say(console, text)
 
 
 # -------------------------------------------------------------------------------------
@@ -240,11 +239,11 @@ def show_points(console: Console, done: Done) -> None:
     rms = [number(a, digits(a)) for a in np.sqrt(np.mean(deviations**2, axis=0))]
     weakest = points.names[free[int(np.argmax(np.max(deviations, axis=1)))]]
     most = float(np.max(deviations))
-    console.print(
+    say(
+        console,
         f"{free.size} unknown points: standard deviations X {rms[0]}, Y {rms[1]}, "
         f"Z {rms[2]} (root mean square), the weakest of {weakest} with "
         f"{number(most, digits(most))}",
-        markup=False,
     )
 
 

@@ -5,12 +5,11 @@ from collections import defaultdict
 import numpy as np
 from jaxtyping import Int
 from rich.console import Console
-from rich.markup import escape
 
 from .columns import OUTCOME_ADVICE
 from .pair import join_names
 from .rows import left_out, most_rows
-from .text import number, table
+from .text import escape, number, say, table
 from .verdicts import Verdicts
 
 
@@ -49,7 +48,7 @@ def show_one(console: Console, verdicts: Verdicts, pair: int, unit: str) -> None
     _show_rejections(console, verdicts, own, unit, many=False)
     doubtful = verdicts.undecided
     if pair in doubtful:
-        console.print(_doubt(doubtful[pair]), markup=False)
+        say(console, _doubt(doubtful[pair]))
 
 
 def _show_rejections(
@@ -85,10 +84,10 @@ def _show_rejections(
         owners = verdicts.table.names[owner[unchecked]]
         named = [f"{a} {b}" for a, b in zip(owners, points, strict=True)]
         listed = join_names(named if many else list(points), most_rows())
-        console.print(
+        say(
+            console,
             "Below the limit, but checked by no other point, and so perhaps by chance "
             f"among so many wrong ones: {listed}",
-            markup=False,
         )
 
 
@@ -97,7 +96,7 @@ def _show_doubts(console: Console, verdicts: Verdicts, many: bool) -> None:
     doubtful, names = verdicts.undecided, verdicts.table.names
     for pair in list(doubtful)[: most_rows()]:
         of = f"{names[pair]}: " if many else ""
-        console.print(of + _doubt(doubtful[pair]), markup=False)
+        say(console, of + _doubt(doubtful[pair]))
     left_out(console, len(doubtful), "undecided pairs")
 
 

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from .pair import digits, table
 from .rows import left_out, worst
-from .text import number
+from .text import escape, number
 
 AXES = ("X", "Y", "Z")
 LEVEL = 0.05

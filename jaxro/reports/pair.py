@@ -9,14 +9,13 @@ from typing import Any, SupportsFloat
 import numpy as np
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from ..orientation.pure_rotation import ANGLES, PureRotation
 from ..tables.measured import COORDINATES
-from .model import One, Results
+from .model import WRONG_AS_A_WHOLE, One, Results
 from .rows import left_out, most_rows, worst
-from .text import number
+from .text import escape, number
 
 HIGH = 0.95
 """Correlations of elements above this are named."""
@@ -225,7 +224,8 @@ def table(first: str, *numbers: str, title: str | None = None) -> Table:
         "padding": (0, 1, 0, 0),
         "title_justify": "left",
     }
-    rows = Table(title=title and escape(title), **style)
+    lines = None if title is None else "\n".join(map(escape, title.split("\n")))
+    rows = Table(title=lines, **style)
     rows.add_column(first, no_wrap=True)
     for head in numbers:
         rows.add_column(

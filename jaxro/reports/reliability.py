@@ -4,7 +4,6 @@ sentences."""
 import numpy as np
 from jaxtyping import Bool
 from rich.console import Console
-from rich.markup import escape
 
 from ..adjustment import critical_values
 from ..assessment.likelihood import CURVED
@@ -12,7 +11,7 @@ from ..assessment.reliability import BOUNDS
 from .model import USUAL, Element, One, Results
 from .pair import digits, join_names, table, unit_name
 from .rows import left_out, worst
-from .text import number
+from .text import escape, number
 
 DOUBTFUL = 0.05
 """Probability of sigma0 below which it is mentioned."""

@@ -2,12 +2,11 @@
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
 from .pair import table
 from .rows import left_out, worst
 from .survey_files import Done, shares
-from .text import number
+from .text import escape, number, say
 
 SOURCES = {
     "camera_height": "camera height",
@@ -32,7 +31,7 @@ def show(console: Console, done: Done, title: str) -> None:
     for doubt in doubts(done):
         console.print(f"[red]Mind:[/red] {escape(doubt)}")
     for note in notes(done):
-        console.print(f"Mind: {note}", markup=False)
+        say(console, f"Mind: {note}")
 
 
 def contents_in_words(done: Done) -> str:

@@ -91,6 +91,11 @@ def consoles() -> tuple[Console, Console]:
     )
 
 
+def warn(errors: Console, text: str) -> None:
+    """A warning, in one line."""
+    errors.print(f"Warning: {tell(text)}", style="yellow", markup=False)
+
+
 @contextmanager
 def steady_streams() -> Iterator[Callable[[], OSError | None]]:
     """Standard output and error that never stop the work; the error of standard output

@@ -1,11 +1,14 @@
-"""Tables of an experiment for the terminal; the only place here that needs rich."""
+"""Words, numbers and tables for the terminal, where names of users are text."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING, SupportsFloat
 
+from ..tables.fields import tell
+
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
 
@@ -21,6 +24,18 @@ def table(*heads: str, left: int = 1) -> Table:
             Text(head), justify="left" if place < left else "right", no_wrap=True
         )
     return empty
+
+
+def escape(text: str) -> str:
+    """A name, or a sentence with names, as markup that shows it as it is, in one line."""
+    from rich.markup import escape as in_markup
+
+    return in_markup(tell(text))
+
+
+def say(console: Console, text: str) -> None:
+    """A sentence with names, in one line."""
+    console.print(tell(text), markup=False)
 
 
 def number(value: SupportsFloat, digits: int) -> str:
