@@ -22,6 +22,12 @@ PARALLEL = 1e-12
 """Determinant of Σ (1 - d dᵀ) over the cube of the number of photos, below which rays
 count as parallel."""
 
+EXACT = 1e-4
+"""Angle by which rays miss their point at the least, for their weights."""
+
+ROUNDS = 12
+"""Rounds of weights: the first one is that of least squares."""
+
 
 class Models(NamedTuple):
     """Oriented pairs: the numbers of their photos, the rotation of right camera axes
@@ -208,24 +214,40 @@ def rays_of(block: MeasuredBlock) -> Float[np.ndarray, "ray 3"]:
 
 
 def intersect(block: MeasuredBlock, chained: Chained) -> Float[np.ndarray, "point 3"]:
-    """The points nearest to their rays, Σ (1 - d dᵀ) (X - S) = 0; NaN for points on one
-    photo, and where all rays are parallel."""
+    """The points with the smallest sums of distances from their rays, as seen from the
+    photos, which a wrong ray among several right ones hardly moves. NaN for points on
+    one photo, and where all rays are parallel.
+
+    Each round solves Σ p (1 - d dᵀ) (X - S) = 0 with weights p of one over the angle by
+    which a ray missed the point before, and over the square of their distance.
+    """
     turned = chained.rotations[block.photo]
     d = np.einsum("rji,rj->ri", turned, rays_of(block))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     across = np.eye(3) - d[:, :, None] * d[:, None, :]
-    right = np.einsum("rij,rj->ri", across, chained.centres[block.photo])
+    stations = chained.centres[block.photo]
     number = len(block.points)
-    n, h = np.zeros((number, 3, 3)), np.zeros((number, 3))
-    np.add.at(n, block.point, across)
-    np.add.at(h, block.point, right)
     seen = np.unique(np.stack([block.point, block.photo]), axis=1)[0]
     photos = np.bincount(seen, minlength=number)
-    # the determinant of parallel rays is rounding
-    there = (photos >= 2) & (np.linalg.det(n) > PARALLEL * photos**3)
-    n[~there] = np.eye(3)
-    found = np.linalg.solve(n, h[:, :, None])[:, :, 0]
-    return np.where(there[:, None], found, np.nan)
+    weight = np.ones(len(block.photo))
+    found = np.full((number, 3), np.nan)
+    for _ in range(ROUNDS):
+        n, h = np.zeros((number, 3, 3)), np.zeros((number, 3))
+        rows = weight[:, None, None] * across
+        np.add.at(n, block.point, rows)
+        np.add.at(h, block.point, np.einsum("rij,rj->ri", rows, stations))
+        # the determinant of parallel rays is rounding
+        size = np.trace(n, axis1=1, axis2=2) / 2
+        there = (photos >= 2) & (np.linalg.det(n) > PARALLEL * size**3)
+        n[~there] = np.eye(3)
+        met = np.linalg.solve(n, h[:, :, None])[:, :, 0]
+        found = np.where(there[:, None], met, found)
+        away = np.nan_to_num(found)[block.point] - stations
+        far = np.maximum(np.linalg.norm(away, axis=1), np.finfo(float).tiny)
+        off = np.linalg.norm(np.einsum("rij,rj->ri", across, away), axis=1) / far
+        weight = 1 / (np.maximum(off, EXACT) * far**2)
+        weight /= np.max(weight)
+    return found
 
 
 def _common(block: MeasuredBlock, models: Models) -> Seen:

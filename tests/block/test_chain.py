@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxro import block
-from jaxro.block.chain import Models, chain, least_closures
+from jaxro.block.chain import Models, chain, intersect, least_closures
 
 MOCK = block.mock_block(1, block.Flight(strips=2, models=4, sigma=1e-9))
 
@@ -58,3 +58,21 @@ def test_a_wrong_pair_does_no_harm(pair):
     np.testing.assert_allclose(closures[pair], 2 * np.sin(angle / 2), rtol=1e-9)
     assert np.max(np.delete(closures, pair)) < 1e-12
     assert farthest(chain(MOCK.block, models)) < 1e-6
+
+
+def test_one_wrong_ray_of_several_hardly_moves_its_point():
+    """A ray with the name of another point: without weights it takes the point along."""
+    mock = block.mock_block(2, block.Flight(strips=2, models=4))
+    given = mock.block
+    rays = np.bincount(given.point)
+    point = int(np.argmax(rays))
+    assert rays[point] >= 4
+    wrong = np.flatnonzero(given.point == point)[0]
+    x = given.x.copy()
+    x[wrong] += 0.3 * given.focal[given.photo[wrong]]
+    found = intersect(given._replace(x=x), mock.photos)
+    height = np.mean(mock.photos.centres[:, 2]) - mock.points[point, 2]
+    off = np.linalg.norm(found - mock.points, axis=1)
+    assert off[point] < 1e-3 * height
+    others = np.arange(len(rays)) != point
+    np.testing.assert_allclose(found[others], intersect(given, mock.photos)[others])

@@ -135,12 +135,13 @@ SLOW = ("page", "pictures", "all")
 
 
 def cases(command, *without):
-    """Inputs with outputs; of slow outputs only a table is in the quick tests."""
+    """Inputs with outputs; of the slow ones only all of a table together are in the
+    quick tests."""
     for kind in INPUTS:
         for output in OUTPUTS:
             if output in without:
                 continue
-            slow = output in SLOW and kind != "pairs.csv"
+            slow = output in SLOW and (kind, output) != ("pairs.csv", "all")
             marks = [pytest.mark.slow] if slow else []
             yield pytest.param(command, kind, output, marks=marks)
 
