@@ -55,6 +55,7 @@ from .batches.batch import (
     map_batch as map_batch,
     orient_batch as orient_batch,
 )
+from .batches.closures import Closures as Closures, close_triplets as close_triplets
 from .batches.ragged import (
     Ragged as Ragged,
     clean_ragged as clean_ragged,

@@ -121,10 +121,16 @@ def grown_cofactor(
     those that it has; `freedom`: its degrees of freedom. Those that are not of least
     squares grow as these do. Works under jit and vmap."""
     q, grown, _ = _correlate(pair, elements, freedom, rho, length)
-    plain = _factor(q)
-    own = [[*row[:-1], 1 / row[-1]] for row in _factor(cofactor)]
-    turn = _dense(own) @ _dense(normal.inverse_of_lower(plain))
-    return turn @ grown @ turn.T
+    change = change_between(q, cofactor)
+    return change @ grown @ change.T
+
+
+def change_between(
+    some: Float[Array, "5 5"], others: Float[Array, "5 5"]
+) -> Float[Array, "5 5"]:
+    """The lower triangle M with M Q Mᵀ = Q' of two matrices of cofactors."""
+    own = [[*row[:-1], 1 / row[-1]] for row in _factor(others)]
+    return _dense(own) @ _dense(normal.inverse_of_lower(_factor(some)))
 
 
 def allow_for_neighbours(

@@ -31,11 +31,7 @@ def allow(
     the columns as they are, and None, where its test is not sure of it."""
     if pattern is None or not pattern.sure:
         return of_pairs, None
-    # of dependent elements the base is given
-    base = (
-        of_pairs["bx"] if system is DependentElements else np.ones(len(pairs.lengths))
-    )
-    elements = _elements(of_pairs["pose"], base, system=system)
+    elements = elements_of_poses(of_pairs, system)
     asked = elements, of_pairs["cofactor"], of_pairs["degrees_of_freedom"]
     cofactor = table_neighbours.grow(pairs, *asked, pattern)
     _, deviations = report_all(elements, cofactor, of_pairs["sigma0"])
@@ -47,6 +43,16 @@ def allow(
     changed |= {"cofactor": cofactor, "correlation": correlation}
     there = growth[np.isfinite(growth)]
     return of_pairs | changed, float(np.median(there)) if there.size else None
+
+
+def elements_of_poses(
+    of_pairs: dict[str, Any], system: type[AbstractElements]
+) -> AbstractElements:
+    """The elements of the pairs in a system."""
+    poses = of_pairs["pose"]
+    # of dependent elements the base is given
+    base = of_pairs["bx"] if system is DependentElements else np.ones(len(poses))
+    return _elements(poses, base, system=system)
 
 
 @compiled

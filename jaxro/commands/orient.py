@@ -24,7 +24,7 @@ from ..tables import csv as tables, whole
 from ..tables.cameras import Cameras
 from ..tables.fields import TableError
 from ..tables.measured import CameraPairs, Table, tell_copies, to_ragged
-from . import neighbours, other_programs, sigma as deviation
+from . import closures, neighbours, other_programs, sigma as deviation
 from .causes import name_causes, tell_causes
 from .documents import settings, show_json
 from .model_accuracy import add_model_errors
@@ -169,6 +169,9 @@ def solve_table(job: Job, told: Told) -> tuple[Results, Verdicts | None]:
         if growth is None:  # the misfit tells nothing of errors that agree
             told_of["intervals"] = _intervals(job, used, found)
         found = found._replace(of_pairs=of_pairs)
+        told_of["closures"] = closures.find(
+            job.table, job.known, used, of_pairs, system, job.task.sigma_known
+        )
     if job.options.out is not None:
         found = add_model_errors(used, found, job.task, plan)
     known, unit = job.task.sigma_known, job.units.photo

@@ -21,6 +21,11 @@ UNJOINED = (
     "lengths of their bases, and their edges hold rotation and direction alone"
 )
 
+SHARED = (
+    "edges share measurements with others: their deviations are up to {most} times those "
+    "of the pair alone, as a file of g2o takes edges for independent"
+)
+
 
 def graph_text(
     table: Table, cameras: Cameras, pairs: Ragged, sigma_known: bool, **options: Any
@@ -46,7 +51,13 @@ def graph_text(
     deviations = np.where(joined, known.deviation, UNKNOWN * known.length)
     try:
         graph = pose_graph(
-            left, right, oriented, known.length, deviations, sigma0=sigma0
+            left,
+            right,
+            oriented,
+            known.length,
+            deviations,
+            pairs=pairs,
+            sigma0=sigma0,
         )
     except ValueError as error:
         raise TableError(
@@ -56,6 +67,9 @@ def graph_text(
         ) from None
     edges, vertices = len(graph.left), len(graph.photos)
     told = f"{vertices} photos, {edges} edges"
+    if sharing := int(np.sum(graph.factor > 1)):
+        most = f"{np.sqrt(np.max(graph.factor)):.3g}"
+        told += f". {sharing} {SHARED.format(most=most)}"
     usable = np.asarray(oriented.usable)
     if open_ := int(np.sum(~joined & usable)):
         told += f". {open_} {UNJOINED}"

@@ -10,6 +10,7 @@ from .matches import Matches as Matches
 from .opencv import pair_from_opencv as pair_from_opencv
 from .pixels import PhotoPoints as PhotoPoints, pair_from_pixels as pair_from_pixels
 from .pose_covariance import (
+    joint_pose_covariance as joint_pose_covariance,
     photo_covariances as photo_covariances,
     pose_covariance as pose_covariance,
     pose_information as pose_information,

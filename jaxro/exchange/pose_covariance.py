@@ -14,13 +14,21 @@ a length that is known exactly, Σ has rank 5. Its inverse, the information
 
 exists for s = ∞, too, a length that nothing tells: then it is zero for the displacement
 along the base, which is what the measurements say of it.
+
+Poses of pairs that share measurements are not independent; `joint_pose_covariance` has
+those of all pairs together.
 """
+
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ..batches.joint import joint_root
+from ..batches.ragged import Ragged
 from ..block.adjust import BlockAdjustment
 from ..block.covariance import relative_covariance
 from ..calibration.camera import Station
@@ -89,6 +97,42 @@ def pose_information(
     joint[..., 5, 5] = spread**-2.0
     back = _inverse(slope)
     return _symmetric(back.swapaxes(-1, -2) @ joint @ back)
+
+
+def joint_pose_covariance(
+    left: Sequence[str],
+    right: Sequence[str],
+    pairs: Ragged,
+    orientation: Orientation,
+    tangent: Tangent = gtsam,
+    *,
+    length: ArrayLike = 1.0,
+    length_deviation: ArrayLike = 0.0,
+    sigma0: ArrayLike | None = None,
+) -> Any:
+    """Σ of the right cameras relative to the left ones of all pairs together, a sparse
+    matrix (6 · pair, 6 · pair): of each pair that of `pose_covariance`, and of two pairs
+    that share measurements what their errors have in common.
+
+    `left` and `right` name the photos of the pairs, whose measurements are `pairs`: two
+    pairs share what is at one place of one photo. Lengths are taken as measured by
+    themselves. Other arguments as of `pose_covariance`. Rows and columns of pairs that
+    are not usable are zero.
+    """
+    from scipy.sparse import block_diag, diags_array
+
+    found = jax.tree.map(np.asarray, orientation)
+    usable = np.asarray(orientation.usable)[:, None, None]
+    slope, _ = _parts(orientation, tangent, length, sigma0)
+    slope = np.where(usable, slope, 0.0)
+    cofactor = np.where(usable, found.cofactor, np.nan)
+    root = joint_root(left, right, pairs, found.elements, cofactor)
+    unit = np.broadcast_to(found.sigma0 if sigma0 is None else sigma0, len(slope))
+    unit = np.where(usable, unit[:, None, None], 0.0)
+    spread = np.broadcast_to(np.asarray(length_deviation, float), len(slope))
+    by_elements = block_diag(list(unit * slope[:, :, :5])).tocsr() @ root
+    by_length = block_diag(list(slope[:, :, 5:])).tocsr() @ diags_array(spread)
+    return by_elements @ by_elements.T + by_length @ by_length.T
 
 
 def _parts(

@@ -22,18 +22,31 @@ GTSAM factorises each information by Cholesky and, without a word, makes somethi
 of one that is not positive definite. For it give a deviation of UNKNOWN times the length
 where nothing tells the length.
 
-Edges count as independent in a pose graph. They are where no two pairs share measured
-places; pairs of a block do, and only `jaxro.block` adjusts those with all their
-correlations.
+Edges count as independent in a pose graph. Those of pairs that share measurements are
+not: each counts the same measurement again, and the photos come out as more certain than
+they are. No file of g2o can say so. Given the measurements, the information of each edge
+is divided by a factor: the largest eigenvalue of the correlations of all edges that are
+joined by shared measurements, with which
+
+    factor · diag(Σ_1, Σ_2, ...) - Σ    is positive semidefinite,
+
+so that nothing that is computed from the edges is told with a deviation that is too
+small. Closures of triplets, of which the errors cancel, are then smaller than their
+deviations say, and no test of them is worth anything: `joint_pose_covariance` has the
+correlations, `close_triplets` the closures with them, and `jaxro.block` adjusts the
+measurements themselves.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
+from ..batches.joint import joint_root, largest_correlations
+from ..batches.ragged import Ragged
 from ..geometry.camera_axes import invert
 from ..orientation.result import Orientation
 from ..tables.fields import tell
@@ -50,7 +63,8 @@ class PoseGraph(NamedTuple):
     """Photos and what pairs measure between them. `poses`: approximate T of each photo;
     `fixed`: the first photo of every part that no edge joins to another one. `left`,
     `right`: the numbers of the photos of each edge; `measured`: the right camera in the
-    axes of the left one; `information` of its displacement."""
+    axes of the left one; `information` of its displacement, and the `factor` by which it
+    has been divided for measurements that edges share, 1 for none."""
 
     photos: tuple[str, ...]
     poses: Float[np.ndarray, "photo 3 4"]
@@ -59,6 +73,7 @@ class PoseGraph(NamedTuple):
     right: Int[np.ndarray, " edge"]
     measured: Float[np.ndarray, "edge 3 4"]
     information: Float[np.ndarray, "edge 6 6"]
+    factor: Float[np.ndarray, " edge"]
 
 
 def pose_graph(
@@ -68,21 +83,23 @@ def pose_graph(
     lengths: ArrayLike = 1.0,
     length_deviations: ArrayLike = np.inf,
     *,
+    pairs: Ragged | None = None,
     sigma0: ArrayLike | None = None,
     tangent: Tangent = g2o,
 ) -> PoseGraph:
     """The graph of oriented pairs, of which `left` and `right` name the photos.
 
     `lengths` of the bases and their standard deviations, infinite where nothing is
-    known of a length, then 1 will do. `sigma0`: known before the measurement, 1 where
-    the sigmas given are standard deviations; without it each pair has its own estimate,
-    which of few points is uncertain. Pairs that are not usable, or without redundancy
-    and without a given `sigma0`, have no edge. Raises ValueError where none has one.
+    known of a length, then 1 will do. `pairs`: what was measured; without it edges count
+    as independent, which they are where no two pairs share places. `sigma0`: known
+    before the measurement, 1 where the sigmas given are standard deviations; without it
+    each pair has its own estimate, which of few points is uncertain. Pairs that are not
+    usable, or without redundancy and without a given `sigma0`, have no edge. Raises
+    ValueError where none has one.
     """
     photos, numbers = np.unique(np.array([left, right]), return_inverse=True)
     one, other = numbers.reshape(2, -1)
-    pairs = one.shape
-    deviations = np.broadcast_to(np.asarray(length_deviations, float), pairs)
+    deviations = np.broadcast_to(np.asarray(length_deviations, float), one.shape)
     information = pose_information(
         oriented,
         tangent,
@@ -96,6 +113,13 @@ def pose_graph(
             "pose_graph: no pair is usable, with a standard deviation and two photos"
         )
     measured = _inverses(np.asarray(cam_from_world(oriented, lengths)))[use]
+    factor = np.ones(len(use))
+    if pairs is not None:
+        found = jax.tree.map(np.asarray, oriented)
+        cofactor = np.where(use[:, None, None], found.cofactor, np.nan)
+        root = joint_root(left, right, pairs, found.elements, cofactor)
+        factor = largest_correlations(root, cofactor)
+        information = information / factor[:, None, None]
     one, other, information = one[use], other[use], information[use]
     poses, fixed = _spread(len(photos), one, other, measured, information)
     there = np.zeros(len(photos), bool)
@@ -109,6 +133,7 @@ def pose_graph(
         right=number[other],
         measured=measured,
         information=information,
+        factor=factor[use],
     )
 
 

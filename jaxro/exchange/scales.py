@@ -17,8 +17,8 @@ the matrix of the least squares, the logarithms have the covariance
 
     Σ_p (G A_p) C_p (G A_p)ᵀ + G N Gᵀ.
 
-Pairs that share measured places have correlated orientations, which is left out. The
-matrices are dense: for some thousand pairs.
+Pairs that share measured places have correlated orientations (`batches.joint`), which is
+left out. The matrices are dense: for some thousand pairs.
 """
 
 from collections.abc import Sequence

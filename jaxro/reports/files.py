@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..assessment import Pattern
+from ..batches.closures import Closures
 from ..geometry.pairs import Camera
 from ..orientation.pure_rotation import ANGLES, PureRotation
 from ..tables.measured import to_list
@@ -105,6 +106,24 @@ def _pattern(pattern: Pattern | None, units: Units) -> dict[str, float] | None:
     return {name: float(value) for name, value in told.items()}
 
 
+def _closures(closures: Closures | None) -> dict[str, Any] | None:
+    """How the triplets of photos close, all together and the worst one."""
+    if closures is None:
+        return None
+    worst = closures.worst
+    return {
+        "triplets": len(closures.photos),
+        "factor": math.sqrt(closures.ratio),
+        "degrees_of_freedom": closures.freedom,
+        "probability": closures.probability,
+        "worst": {
+            "photos": list(closures.photos[worst]),
+            "angle": math.degrees(closures.angles[worst]),
+            "factor": math.sqrt(closures.squares[worst] / 3),
+        },
+    }
+
+
 def summary_of(results: Results, summary: dict[str, Any]) -> dict[str, Any]:
     """The content of summary.json."""
     units = asdict(results.units) | {
@@ -116,6 +135,7 @@ def summary_of(results: Results, summary: dict[str, Any]) -> dict[str, Any]:
         "units": units,
         "pattern": _pattern(results.pattern, results.units),
         "growth_of_deviations": results.growth,
+        "closures": _closures(results.closures),
         "pairs": [_pair(one) for one in results],
     }
 

@@ -15,6 +15,7 @@ from ..adjustment import critical_values
 from ..assessment import Pattern, likelihood
 from ..batches import table_neighbours
 from ..batches.after_cleaning import AfterCleaning
+from ..batches.closures import Closures
 from ..batches.padding import sizes
 from ..batches.ragged import Ragged
 from ..geometry.elements import (
@@ -68,7 +69,8 @@ class Results:
     `table` holds, those kept. `confidence`: of the intervals that are asked for. By the
     numbers of the pairs: `patterns`, `rotations` of pairs without a base, `intervals`
     by likelihood of pairs whose deviations do not say it all. `growth`: by how much
-    deviations allow for neighbours that agree; None where none do. `promises`: what
+    deviations allow for neighbours that agree; None where none do. `closures`: of
+    triplets of photos; None where there are none. `promises`: what
     intervals really hold after cleaning, where that was simulated. `causes`: sentences
     about units, origin and sigma0 that are to be read first."""
 
@@ -84,6 +86,7 @@ class Results:
     rotations: dict[int, PureRotation] = field(default_factory=dict)
     intervals: dict[int, likelihood.Interval] = field(default_factory=dict)
     growth: float | None = None
+    closures: Closures | None = None
     promises: dict[int, AfterCleaning] = field(default_factory=dict)
     causes: dict[int, list[str]] = field(default_factory=dict)
 

@@ -1,6 +1,8 @@
 """How far the measurements of a pair check one another, on the terminal: a table and
 sentences."""
 
+import math
+
 import numpy as np
 from jaxtyping import Bool
 from rich.console import Console
@@ -111,7 +113,8 @@ def chance_of_sigma0(one: One) -> float:
 def sentences_of_many(results: Results) -> list[str]:
     """What to mind of all pairs together."""
     promised = [f"{one.name}: {said}" for one in results for said in promises(one)]
-    return _doubt_sigma_of_many(results) + _neighbours(results) + promised
+    together = _doubt_sigma_of_many(results) + _neighbours(results)
+    return together + _closures(results) + promised
 
 
 def find_too_large(results: Results) -> Bool[np.ndarray, " pair"]:
@@ -185,6 +188,25 @@ def _neighbours(results: Results) -> list[str]:
     return [
         f"{said}: the standard deviations allow for it, and are {larger} times those of "
         "independent errors."
+    ]
+
+
+def _closures(results: Results) -> list[str]:
+    """What it means that triplets of photos do not close, where they do not."""
+    closures = results.closures
+    if closures is None or not closures.open:
+        return []
+    several, worst = len(closures.photos), closures.worst
+    factor = number(math.sqrt(closures.ratio), 1)
+    angle = math.degrees(closures.angles[worst])
+    own = number(math.sqrt(closures.squares[worst] / 3), 1)
+    of = "Three photos do" if several == 1 else f"{several} triplets of photos do"
+    return [
+        f"{of} not close: their rotations are off by {factor} times what the standard "
+        f"deviations say (probability {closures.probability:.1g}), most those of "
+        f"{', '.join(closures.photos[worst])} ({number(angle, digits(angle))}°, {own} "
+        "times). A pair is wrong, or pairs have errors in common, such as those of "
+        "the lens, of which their standard deviations know nothing."
     ]
 
 

@@ -49,6 +49,7 @@ def test_g2o_has_one_line_for_each_photo():
         right=nothing,
         measured=np.tile(np.eye(3, 4), (0, 1, 1)),
         information=np.zeros((0, 6, 6)),
+        factor=np.zeros(0),
     )
     lines = g2o_text(graph).splitlines()
     assert len(lines) == 2 * count + 1
