@@ -125,6 +125,19 @@ def grown_cofactor(
     return change @ grown @ change.T
 
 
+@jax.jit
+def unit_growth(
+    pair: Pair,
+    elements: AbstractElements,
+    freedom: Int[Array, ""],
+    rho: ArrayLike,
+    length: ArrayLike,
+) -> Float[Array, ""]:
+    """s / sigma0: by how much errors that agree are larger than the residuals that they
+    leave in one oriented pair."""
+    return jnp.sqrt(_correlate(pair, elements, freedom, rho, length)[2])
+
+
 def change_between(
     some: Float[Array, "5 5"], others: Float[Array, "5 5"]
 ) -> Float[Array, "5 5"]:

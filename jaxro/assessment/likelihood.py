@@ -13,7 +13,9 @@ the likelihood ratio of x against x0 (Wilks 1938). The interval of one number h(
 reaches from its least to its largest value where S is above its minimum by at most s²
 times the square of the normal quantile, or of Student's t (Venzon and Moolgavkar 1988).
 
-For orientations with rigorous residuals and without a loss.
+For orientations with rigorous residuals and without a loss. Of weights that were chosen
+by the residuals S is no likelihood: of such a pair `ends` is asked with a limit for each
+number at which the parabola of S ends where the deviation of the M-estimate does.
 """
 
 from collections.abc import Callable
@@ -158,21 +160,22 @@ def _unit(orientation: Orientation, sigma0: ArrayLike | None) -> Number:
 
 @compiled
 def ends(
-    pair: Pair, centre: AbstractElements, limit: Number, *, quantity: Quantity
+    pair: Pair, centre: AbstractElements, limit: ArrayLike, *, quantity: Quantity
 ) -> Interval:
     """The least and the largest values of numbers of the elements where S is above its
-    minimum, in `centre`, by the limit."""
+    minimum, in `centre`, by the limit, one for all numbers or of each."""
     residuals = coplanarity.residuals(mask_unusable(pair)[0], centre)
     white = lambda x: residuals(tuple(x))
     number = lambda x: quantity(centre, centre.move(x).normalise())
     origin = jnp.zeros(centre.count)
 
-    def end(which: Int[Array, ""], sign: Number) -> Number:
+    def end(which: Int[Array, ""], limit: Number, sign: Number) -> Number:
         return _End(white, lambda x: number(x)[which], origin, limit, sign).find()
 
     numbers = jnp.arange(jax.eval_shape(number, origin).size)
-    find = jax.vmap(end, in_axes=(0, None))
-    return Interval(find(numbers, jnp.asarray(-1.0)), find(numbers, jnp.asarray(1.0)))
+    limits = jnp.broadcast_to(jnp.asarray(limit, float), numbers.shape)
+    find = jax.vmap(end, in_axes=(0, 0, None))
+    return Interval(*(find(numbers, limits, jnp.asarray(sign)) for sign in (-1.0, 1.0)))
 
 
 class _Way(NamedTuple):

@@ -4,20 +4,24 @@ just the right points, and how often the true pose lies in the region it promise
 The pose that was found is taken for the truth, and the points kept are moved onto its
 condition by their corrections. In every repetition all coordinates get normal errors,
 and as many points as were rejected, drawn anew, get a wrong partner. The same procedure
-then cleans the pair, and its points and pose are compared with the truth.
+then cleans the pair, and its points and pose are compared with the truth. Where the
+errors of neighbours agree, those of the repetitions do, and deviations are those that
+allow for it.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from ..adjustment import critical_values
 from ..adjustment.normal_equations import solve
+from ..assessment.correlated import allow_for_neighbours
 from ..geometry import coplanarity, rotations as rot
 from ..geometry.elements import RelativePose
 from ..geometry.mock_pairs import draw_points, plant
@@ -61,6 +65,26 @@ class AfterCleaning(NamedTuple):
 Tell = Callable[[Pair, Orientation], tuple[Array, Array]]
 """What is promised of an orientation: the errors of some elements against the truth, and
 their standard deviations."""
+
+
+class Agreement(NamedTuple):
+    """Of the errors of a coordinate at two points of a photo, d apart: the correlation
+    rho exp(-(d/length)²) (`assessment.neighbours`)."""
+
+    rho: Float[Any, ""]
+    length: Float[Any, ""]
+
+    def roots(self, pair: Pair) -> Float[Array, "2 point point"]:
+        """The roots of the correlations of all points on the left and the right photo."""
+        each = []
+        for x, y in (pair.coordinates[:2], pair.coordinates[2:]):
+            at = np.stack([np.asarray(x), np.asarray(y)], axis=1)
+            squared = np.sum((at[:, None] - at[None]) ** 2, axis=2)
+            agree = float(self.rho) * np.exp(-squared / float(self.length) ** 2)
+            np.fill_diagonal(agree, 1.0)
+            values, vectors = np.linalg.eigh(agree)
+            each.append(vectors * np.sqrt(np.maximum(values, 0.0)))
+        return jnp.asarray(np.stack(each))
 
 
 class Found(NamedTuple):
@@ -137,16 +161,26 @@ def repeat_cleaning(
     largest: float | None = None,
     confidence: float = 0.95,
     tell: Tell | None = None,
+    agreement: Agreement | None = None,
 ) -> AfterCleaning:
     """`after_cleaning` of a pair that a procedure oriented like this, with these points
     kept. `tell`: the elements whose intervals are looked at; the five local ones of the
-    pose if not given."""
+    pose if not given. `agreement`: of the errors of neighbours; deviations then allow
+    for it."""
     pair, _ = mask_unusable(pair)
     pairs, wrong = simulate(
-        pair, pose, kept, key, repetitions, sigma0=sigma0, largest=largest
+        pair,
+        pose,
+        kept,
+        key,
+        repetitions,
+        sigma0=sigma0,
+        largest=largest,
+        agreement=agreement,
     )
     tell = _OfPose(pose) if tell is None else tell
-    found = clean_batch(pairs, procedure, read=_Read(tell))
+    told = None if agreement is None else Agreement(*map(jnp.asarray, agreement))
+    found = clean_batch(pairs, procedure, read=_Read(tell, told))
     each = compare(pair, pose, wrong, found, sigma0, confidence)
     number = jnp.sum(pair.mask & ~kept)
     same = jnp.sum(pair.mask[None, :] & ~found.mask, axis=1) == number
@@ -185,6 +219,7 @@ def simulate(
     *,
     sigma0: ArrayLike | None = None,
     largest: float | None = None,
+    agreement: Agreement | None = None,
 ) -> tuple[Pair, Bool[Array, "repetition point"]]:
     """Simulated pairs like the cleaned one, (repetition point) a coordinate, and which
     of their points are wrong.
@@ -205,7 +240,8 @@ def simulate(
         pair, x_left=x_left, y_left=y_left, x_right=x_right, y_right=y_right
     )
     most = jnp.asarray(most, pair.sigma.dtype)
-    repeat = lambda key: _repeat(exact, jnp.sum(rejected), unit, most, key)
+    roots = None if agreement is None else agreement.roots(exact)
+    repeat = lambda key: _repeat(exact, jnp.sum(rejected), unit, most, roots, key)
     return jax.vmap(repeat)(jax.random.split(key, repetitions))
 
 
@@ -214,14 +250,19 @@ def _repeat(
     number: Int[Array, ""],
     unit: Float[Array, ""],
     most: Float[Array, ""],
+    roots: Float[Array, "2 point point"] | None,
     key: PRNGKeyArray,
 ) -> tuple[Pair, Bool[Array, "point"]]:
-    """A pair with normal errors and so many wrong points, and which they are."""
+    """A pair with normal errors and so many wrong points, and which they are. `roots`
+    of the correlations of the errors on each photo, if there are any."""
     points = exact.mask.shape
     which, noise, size = jax.random.split(key, 3)
     wrong = draw_points(which, exact.mask, number)
-    sigma = (unit * exact.sigma)[None, :]
-    errors = sigma * jax.random.normal(noise, (4, *points))
+    errors = jax.random.normal(noise, (4, *points))
+    if roots is not None:
+        of_photos = errors.reshape(2, 2, *points)
+        errors = jnp.einsum("pij,pcj->pci", roots, of_photos).reshape(4, *points)
+    errors = (unit * exact.sigma)[None, :] * errors
     if exact.roots is not None:
         errors = jnp.stack(exact.roots.displace(tuple(errors)))
     partners = jnp.where(wrong[None, :], _wrong_partners(size, most, points), 0.0)
@@ -388,10 +429,14 @@ class _Read(eqx.Module):
     """The results of a procedure that are compared with the truth."""
 
     tell: Tell
+    agreement: Agreement | None = None
 
     def __call__(self, pair: Pair, rejection: Rejection) -> Found:
         orientation = rejection.orientation
         kept = pair.with_mask(rejection.mask)
+        if self.agreement is not None:
+            used = pair.with_mask(rejection.in_use)
+            orientation = allow_for_neighbours(used, orientation, *self.agreement)
         errors, deviations = self.tell(kept, orientation)
         return Found(
             pose=orientation.pose,

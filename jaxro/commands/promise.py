@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..batches.after_cleaning import AfterCleaning, repeat_cleaning
+from ..assessment.correlated import unit_growth
+from ..batches.after_cleaning import AfterCleaning, Agreement, repeat_cleaning
 from ..geometry.elements import AbstractElements, RelativePose, convert
 from ..geometry.pairs import Pair
 from ..orientation.express import express
@@ -53,7 +54,7 @@ def add(job: Job, results: Results, verdicts: Verdicts, repetitions: int) -> Res
 
 
 def _of_pair(
-    job: Job, results: Results, number: int, kept: np.ndarray, repetitions: int
+    job: Job, results: Results, number: int, kept_rows: np.ndarray, repetitions: int
 ) -> AfterCleaning:
     """What simulation says of one pair with these points kept."""
     procedure, system = job.task.procedure, job.task.system
@@ -64,15 +65,25 @@ def _of_pair(
     base = jnp.asarray(of_pairs["bx"][number] if "bx" in of_pairs else 1.0, float)
     elements = convert(pose, system, base)
     truth = report_numbers(elements, elements)
+    pair = jax.tree.map(jnp.asarray, one_pair(job.pairs, number))
+    kept = jnp.asarray(kept_rows, bool)
     unit = None if job.task.sigma_known else float(of_pairs["sigma0"][number])
+    # as the deviations of these results allow for the errors of neighbours
+    pattern, agreement = results.pattern, None
+    if results.growth is not None and pattern is not None:
+        agreement = Agreement(float(pattern.rho), float(pattern.length))
+        if unit is not None:
+            freedom = jnp.asarray(of_pairs["degrees_of_freedom"][number])
+            unit *= float(unit_growth(pair.with_mask(kept), pose, freedom, *agreement))
     return repeat_cleaning(
-        jax.tree.map(jnp.asarray, one_pair(job.pairs, number)),
+        pair,
         pose,
-        jnp.asarray(kept, bool),
+        kept,
         procedure,
         jax.random.fold_in(jax.random.key(SEED), number),
         repetitions=repetitions,
         sigma0=unit,
         confidence=job.options.confidence or USUAL,
         tell=_Reported(truth, base, system),
+        agreement=agreement,
     )

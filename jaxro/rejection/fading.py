@@ -121,6 +121,13 @@ def fade(pair: Pair, pose: RelativePose, use: Use) -> Fading:
     return Fading(needed, factor, noise)
 
 
+def fade_again(pair: Pair, pose: RelativePose) -> Pair:
+    """A pair that was solved with weights that faded, at its pose, with the standard
+    deviations that give its points these weights."""
+    factor, _ = _factors(pair, pose, pair.mask)
+    return dataclasses.replace(pair, sigma=pair.sigma * factor)
+
+
 def is_heavy(pair: Pair, pose: RelativePose, use: Use) -> Bool[Array, ""]:
     """Whether the mean fourth power of the residuals exceeds the one of normal
     residuals by more than chance, or the points left out are so many and so near that

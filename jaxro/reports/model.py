@@ -8,10 +8,11 @@ from itertools import combinations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..adjustment import critical_values
+from ..adjustment import critical_values, normal_equations as normal
 from ..assessment import Pattern, likelihood
 from ..batches import table_neighbours
 from ..batches.after_cleaning import AfterCleaning
@@ -24,8 +25,10 @@ from ..geometry.elements import (
     RelativePose,
     convert,
 )
-from ..geometry.pairs import Camera, Pair
+from ..geometry.linear import linearise
+from ..geometry.pairs import Camera, Pair, mask_unusable
 from ..orientation.pure_rotation import PureRotation, orient_rotation
+from ..rejection.fading import fade_again
 from ..tables.measured import CameraPairs, Table, take, to_list
 from ..xla.programs import compiled
 from .columns import (
@@ -314,8 +317,9 @@ def find_intervals(
     confidence: float | None = None,
 ) -> dict[int, likelihood.Interval]:
     """The intervals by likelihood of the reported numbers of pairs with a large
-    curvature, by the numbers of the pairs; of the first MOST_PAIRS. Weights that have
-    faded leave no sum of squares to tell them by: such pairs have none."""
+    curvature, by the numbers of the pairs; of the first MOST_PAIRS. Of pairs whose
+    weights have faded those by the sum of squares with these weights, as wide near the
+    elements as their deviations say."""
     curved = is_usable(of_pairs["result"]) & (of_pairs["curvature"] > likelihood.CURVED)
     chosen = np.flatnonzero(curved)[:MOST_PAIRS]
     confidence = USUAL if confidence is None else confidence
@@ -329,11 +333,13 @@ def find_intervals(
         own = critical_values.half_width(confidence, freedom) * sigma0
         limit = float(known if sigma_known else own) ** 2
         base = of_pair("bx") if system is DependentElements else 1.0
-        squares, interval = _find_interval(
-            pair, of_pair("pose"), base, limit, system=system
-        )
-        expected = sigma0**2 * freedom
-        if freedom == 0 or abs(squares - expected) <= SAME_SQUARES * expected:
+        asked = pair, of_pair("pose"), base, limit
+        squares, interval = _find_interval(*asked, system=system)
+        expected, there = sigma0**2 * freedom, True
+        if freedom and abs(squares - expected) > SAME_SQUARES * expected:
+            cofactor = of_pair("cofactor")
+            there, interval = _find_faded(*asked, cofactor, sigma0, system=system)
+        if there:
             found[number] = jax.tree.map(np.asarray, interval)
     return found
 
@@ -352,6 +358,40 @@ def _find_interval(
     elements = convert(RelativePose(*pose), system, base)
     ends = likelihood.ends(pair, elements, limit, quantity=report_numbers)
     return likelihood.misfit(pair, elements), ends
+
+
+AT_MINIMUM = 0.1
+"""Of a deviation: weights by which the minimum is farther from the pose than this are
+not those that it was solved with."""
+
+
+@compiled
+def _find_faded(
+    pair: Pair,
+    pose: Float[Array, "7"],
+    base: Float[Array, ""],
+    limit: Float[Array, ""],
+    cofactor: Float[Array, "5 5"],
+    sigma0: Float[Array, ""],
+    *,
+    system: type[AbstractElements],
+) -> tuple[Bool[Array, ""], likelihood.Interval]:
+    """The same with the weights that have faded, and whether the pose is where they have
+    their minimum. `limit`: as of a pair without; `cofactor` and `sigma0`: of the
+    M-estimate."""
+    relative = RelativePose(*pose)
+    elements = convert(relative, system, base)
+    weaker = fade_again(mask_unusable(pair)[0], relative)
+    n, right, _ = linearise(weaker, elements).normal_equations()
+    plain, right = normal.dense(normal.inverse(n)[0]), jnp.stack(right)
+    away = plain @ right
+    in_deviations = away @ right / sigma0**2
+    moved = lambda x: report_numbers(elements, elements.move(x).normalise())
+    slope = jax.jacfwd(moved)(jnp.zeros(5))
+    variance = lambda q: jnp.sum((slope @ q) * slope, axis=1)
+    wider = variance(cofactor) / variance(plain)
+    ends = likelihood.ends(weaker, elements, limit * wider, quantity=report_numbers)
+    return in_deviations < AT_MINIMUM**2, ends
 
 
 def find_patterns(pairs: Ragged, of_pairs: dict[str, Any]) -> dict[int, Pattern]:

@@ -10,6 +10,7 @@ from rich.console import Console
 from ..adjustment import critical_values
 from ..assessment.likelihood import CURVED
 from ..assessment.reliability import BOUNDS
+from ..orientation.verdict import WEAK
 from .model import USUAL, Element, One, Results
 from .pair import digits, join_names, table, unit_name
 from .rows import left_out, worst
@@ -94,7 +95,8 @@ def sentences(one: One) -> list[str]:
     said += doubts(one)
     if len(one.results) == 1:
         said += _neighbours(one.results)
-    said += _bent_deviations(one) + _weak_points(one, points)
+    said += _chosen_by_sigma0(one) + _bent_deviations(one)
+    said += _weak_points(one, points)
     return said + promises(one)
 
 
@@ -293,6 +295,28 @@ def _doubt_points(one: One, points: dict[str, np.ndarray]) -> list[str]:
         f"Point {one.points[int(np.argmax(w))]} has "
         f"|{'w' if one.results.sigma_known else 'tau'}| = {np.max(w):.2f} "
         f"where {limit:.2f} is allowed{also}. Measure it again, or see jaxro clean."
+    ]
+
+
+def _chosen_by_sigma0(one: One) -> list[str]:
+    """What it means that a weak layout was accepted for a sigma0 of few points, where
+    none is known that does not depend on them."""
+    from scipy.stats import chi2
+
+    freedom, results = one.value("degrees_of_freedom"), one.results
+    if results.sigma_known or freedom == 0:
+        return []
+    sigma0, cofactor = one.value("sigma0"), results.of_pairs["cofactor"][one.number]
+    angles = np.array(results.system.angles)
+    largest = sigma0 * math.sqrt(np.max(np.diagonal(cofactor)[angles]))
+    by_chance = math.sqrt(freedom / chi2.ppf(RARE, freedom))
+    if largest * by_chance <= WEAK:
+        return []
+    return [
+        f"sigma0 comes from {freedom} degree{'s' * (freedom != 1)} of freedom, and with "
+        f"{number(WEAK / largest, 1)} times as much the layout would be refused as too "
+        "weak: pairs accepted for a sigma0 that is small by chance have intervals that "
+        "are too narrow. Measure more points, or give --sigma."
     ]
 
 

@@ -4,10 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import jaxro
 from jaxro.adjustment.losses import GemanMcClure
 from jaxro.rejection.fading import FADING, Fading, fade
+from jaxro.reports.model import find_intervals
+from jaxro.reports.reader import report_elements
 
 FOCAL, POINTS = 2000.0, 60
 
@@ -39,3 +42,19 @@ def test_the_last_solution_is_that_of_orient_with_the_loss(sigma):
     np.testing.assert_allclose(difference, 0, atol=1e-4)
     # the weights taken for known ones would promise more
     assert weakened.sigma0 < 0.95 * found.sigma0
+    # the intervals by likelihood have these weights: nearly linear, they are as wide as
+    # the deviations of the M-estimate say
+    columns = {
+        "result": found.result._value,
+        "pose": jnp.stack(jax.tree.leaves(found.pose)),
+        "curvature": 1.0,
+        **{n: getattr(found, n) for n in ("cofactor", "sigma0", "degrees_of_freedom")},
+    }
+    columns = {name: np.asarray(value)[None] for name, value in columns.items()}
+    measured = jax.tree.map(np.asarray, jaxro.join([pair]))
+    (ends,) = find_intervals(measured, columns, jaxro.RelativePose, False).values()
+    told = report_elements(found.elements, found.cofactor, found.sigma0)
+    value, sd = (np.stack(numbers) for numbers in told)
+    half = sd * scipy.stats.t.ppf(0.975, POINTS - 5)
+    for end, there in ((ends.least, value - half), (ends.most, value + half)):
+        assert np.all(np.abs(end - there)[1:] < 0.05 * half[1:])
