@@ -10,6 +10,7 @@ from rich.console import Console
 from ..adjustment import critical_values
 from ..assessment.likelihood import CURVED
 from ..assessment.reliability import BOUNDS
+from ..orientation.degeneracy import FEW
 from ..orientation.verdict import WEAK
 from .model import USUAL, Element, One, Results
 from .pair import digits, join_names, table, unit_name
@@ -298,22 +299,29 @@ def _doubt_points(one: One, points: dict[str, np.ndarray]) -> list[str]:
     ]
 
 
+def may_be_chance(deviation: float, freedom: int) -> bool:
+    """Whether a layout of this largest deviation (rad), by a sigma0 of so many degrees
+    of freedom, may have been accepted as sigma0 is small by chance, of a thousand once.
+    Pairs of `FEW` are judged by what is expected before the measurement."""
+    from scipy.stats import chi2
+
+    if freedom <= FEW:
+        return False
+    return deviation * math.sqrt(freedom / chi2.ppf(RARE, freedom)) > WEAK
+
+
 def _chosen_by_sigma0(one: One) -> list[str]:
     """What it means that a weak layout was accepted for a sigma0 of few points, where
     none is known that does not depend on them."""
-    from scipy.stats import chi2
-
     freedom, results = one.value("degrees_of_freedom"), one.results
-    if results.sigma_known or freedom == 0:
-        return []
-    sigma0, cofactor = one.value("sigma0"), results.of_pairs["cofactor"][one.number]
+    cofactor = results.of_pairs["cofactor"][one.number]
     angles = np.array(results.system.angles)
-    largest = sigma0 * math.sqrt(np.max(np.diagonal(cofactor)[angles]))
-    by_chance = math.sqrt(freedom / chi2.ppf(RARE, freedom))
-    if largest * by_chance <= WEAK:
+    root = math.sqrt(np.max(np.diagonal(cofactor)[angles]))
+    largest = one.value("sigma0") * root
+    if results.sigma_known or not may_be_chance(largest, freedom):
         return []
     return [
-        f"sigma0 comes from {freedom} degree{'s' * (freedom != 1)} of freedom, and with "
+        f"sigma0 comes from {freedom} degrees of freedom, and with "
         f"{number(WEAK / largest, 1)} times as much the layout would be refused as too "
         "weak: pairs accepted for a sigma0 that is small by chance have intervals that "
         "are too narrow. Measure more points, or give --sigma."

@@ -14,6 +14,8 @@ from jaxro.adjustment import m_estimates
 from jaxro.batches.after_cleaning import Agreement, difference, repeat_cleaning
 from jaxro.geometry import mock_pairs
 from jaxro.orientation import planes
+from jaxro.orientation.verdict import WEAK
+from jaxro.reports.reliability import may_be_chance
 
 BASE = 70.0
 TRUE = IndependentElements(*(jnp.asarray(e) for e in (0.03, -0.05, 0.04, -0.02, 0.06)))
@@ -276,3 +278,14 @@ def test_the_promise_is_kept_where_neighbours_agree():
         )
         each.append(np.asarray(told.intervals_known))
     assert np.mean(each) == pytest.approx(np.mean(counted), abs=0.02)
+
+
+def test_a_layout_that_chance_may_have_accepted_is_told():
+    """Of three degrees of freedom sigma0 is small by chance by a factor of eleven once
+    in a thousand: a deviation from an eleventh of the limit on is told. Two are judged
+    by what is expected."""
+    factor = float(np.sqrt(3 / scipy.stats.chi2.ppf(0.001, 3)))
+    assert 11 < factor < 12
+    assert may_be_chance(1.01 * WEAK / factor, 3)
+    assert not may_be_chance(0.99 * WEAK / factor, 3)
+    assert not may_be_chance(0.9 * WEAK, 2) and not may_be_chance(WEAK / 2, 100)

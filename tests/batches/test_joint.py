@@ -122,6 +122,7 @@ def test_triplets_close_as_their_joint_covariance_says(sigma_known):
     rng = np.random.default_rng(3)
     away = pairs._replace(x_left=pairs.x_left + rng.normal(0, SIGMA, len(pairs.x_left)))
     alone = jaxro.close_triplets(left, right, away, oriented, sigma_known=sigma_known)
+    assert alone is not None
     assert np.mean(alone.squares[200:]) < 0.6 * np.mean(found.squares[200:])
 
 
@@ -159,9 +160,9 @@ def test_edges_with_shared_measurements_are_not_overconfident():
         own[5 * k : 5 * k + 5, 5 * k : 5 * k + 5] = factor[k] * cofactor[k]
     least = np.linalg.eigvalsh(own - (root @ root.T).toarray())
     assert least[0] > -1e-9 * least[-1]
-    known = {"lengths": 1.0, "length_deviations": 0.1, "sigma0": 1.0}
-    alone = exchange.pose_graph(left, right, oriented, **known)
-    graph = exchange.pose_graph(left, right, oriented, pairs=pairs, **known)
+    names = left, right, oriented, 1.0, 0.1
+    alone = exchange.pose_graph(*names, sigma0=1.0)
+    graph = exchange.pose_graph(*names, pairs=pairs, sigma0=1.0)
     np.testing.assert_allclose(graph.factor, factor)
     weaker = alone.information / factor[:, None, None]
     np.testing.assert_allclose(graph.information, weaker)
