@@ -25,6 +25,9 @@ count as parallel."""
 EXACT = 1e-4
 """Angle by which rays miss their point at the least, for their weights."""
 
+NEAR = 1e-3
+"""Part of the mean distance of points from photos at which they are at the least."""
+
 ROUNDS = 12
 """Rounds of weights: the first one is that of least squares."""
 
@@ -243,7 +246,8 @@ def intersect(block: MeasuredBlock, chained: Chained) -> Float[np.ndarray, "poin
         met = np.linalg.solve(n, h[:, :, None])[:, :, 0]
         found = np.where(there[:, None], met, found)
         away = np.nan_to_num(found)[block.point] - stations
-        far = np.maximum(np.linalg.norm(away, axis=1), np.finfo(float).tiny)
+        far = np.linalg.norm(away, axis=1)
+        far = np.maximum(far, NEAR * np.mean(far))
         off = np.linalg.norm(np.einsum("rij,rj->ri", across, away), axis=1) / far
         weight = 1 / (np.maximum(off, EXACT) * far**2)
         weight /= np.max(weight)

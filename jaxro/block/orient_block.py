@@ -14,9 +14,10 @@ from ..rejection import Recommended, Rejection
 from .adjust import BlockAdjustment
 from .adjust_chained import Outcome, adjust_chained
 from .bars import Bars, NoBar
-from .chain import Chained, Oriented, chain, models_of
+from .chain import Chained, Oriented, Unjoined, chain, models_of
 from .columns import Cause
 from .components import Component
+from .confusable import tell_confusable
 from .contest import OF_MEASUREMENT, find_cause, is_misplaced
 from .contradictions import contradictions, is_suspicious, stands_under_ground
 from .given import Given, Wrong
@@ -24,6 +25,10 @@ from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, from_pairs
 from .moved_names import find_moved
 from .place import Placed, TooLittleControl
+
+NEARLY_ALL = 0.8
+"""Part of the points of a refused pair that fit, with which it may join photos that
+nothing else joins."""
 
 
 class OrientedBlock(NamedTuple):
@@ -113,7 +118,7 @@ def adjust_and_judge(
             outcome.adjusted
         )
         if not (suspicious or of_ground or is_misplaced(given, chained)):
-            return Judged(outcome)
+            return Judged(outcome, tell_confusable(given, outcome, level))
     cause, explained = _of_field(given), None
     if cause is None:
         found = find_cause(
@@ -133,6 +138,8 @@ def adjust_and_judge(
     against = contradictions(*rest, sigma_known=sigma_known)
     if cause is not None and cause.name in OF_MEASUREMENT and not against:
         cause = cause._replace(is_hint=True)
+    if cause is None and not against:
+        return Judged(outcome, tell_confusable(given, outcome, level))
     return Judged(outcome, tuple(against), cause)
 
 
@@ -173,8 +180,21 @@ def join_pairs(
             f"it: moved by one row {moved.fitting} of the {moved.points} points of its "
             "pairs fit",
         )
-    chained = chain(block, models_of(*ends, oriented))
+    try:
+        chained = chain(block, models_of(*ends, oriented))
+    except Unjoined:
+        # approximate values need no verdict, and the block is judged as a whole
+        oriented = oriented._replace(usable=_nearly_usable(oriented))
+        chained = chain(block, models_of(*ends, oriented))
     return Joined(block, chained, np.asarray(oriented.usable), cause)
+
+
+def _nearly_usable(oriented: Oriented) -> Bool[np.ndarray, " pair"]:
+    """The pairs that may be used, and those refused although nearly all of their points
+    fit a pose that has deviations."""
+    told = np.all(np.isfinite(np.asarray(oriented.cofactor)), axis=(1, 2))
+    fit = np.asarray(oriented.kept) > NEARLY_ALL * np.asarray(oriented.points)
+    return np.asarray(oriented.usable) | (told & fit)
 
 
 def _orient(pairs: Ragged) -> Oriented:

@@ -22,8 +22,9 @@ from ..adjustment import RESULTS, critical_values
 from ..adjustment.sparse import Minimum, Problem, minimise, residuals_of
 from .adjust import BlockAdjustment, adjust_block, conclude
 from .bars import Bars, differences, scale_of
+from .chain import rays_of
 from .given import Given, Wrong, nothing_wrong
-from .measured_block import Ground
+from .measured_block import Ground, MeasuredBlock
 from .network import Start, spread_known
 from .place import TooLittleControl
 from .prepared import Prepared, prepare_block
@@ -46,6 +47,12 @@ TESTS = 20
 
 NEARLY_RIGHT, FEW = 2.0, 6
 """sigma0 of a plain adjustment below which so many rounds of tests come first."""
+
+ASTRAY = 0.1
+"""How far a ray may miss its point at the beginning, in focal lengths."""
+
+DISTANCE = 30.0
+"""By which factor the distance of a point may differ from the usual one."""
 
 DATUM = 7
 """Known coordinates that a block needs."""
@@ -106,19 +113,23 @@ def _without_bars(
     given: Given, start: Start, level: float
 ) -> tuple[BlockAdjustment, Wrong]:
     """The adjustment without wrong rays and known coordinates."""
-    nothing = nothing_wrong(given)
-    plain = adjust_rest(given, start, nothing)
+    strange = nothing_wrong(given)._replace(rays=_strange(given.block, start))
+    plain = adjust_rest(given, start, strange)
     if plain.sigma0 < NEARLY_RIGHT:
-        adjusted, wrong = _test(given, plain, nothing, level, FEW)
+        rays = decide(plain, strange.rays, may_be_right=True)
+        if np.any(rays != strange.rays):
+            strange = strange._replace(rays=rays)
+            plain = adjust_rest(given, plain.as_start, strange)
+        adjusted, wrong = _test(given, plain, strange, level, FEW)
         if wrong.settled:
             return adjusted, wrong
-    prepared = prepare_block(given, start)
+    prepared = prepare_block(given, start, strange.rays)
     found = settle(prepared)
-    wrong = _far(prepared, found)
+    wrong = _far(prepared, found) | strange
     used = wrong.rays[prepared.numbered.rays]
     if found.result != RESULTS.successful or np.mean(used) > MOST:
         lost = found._replace(result=RESULTS.diverged)
-        return conclude(prepared, lost), nothing
+        return conclude(prepared, lost), nothing_wrong(given)
     adjusted = adjust_rest(given, prepared.start_at(found), wrong)
     if adjusted.result != RESULTS.successful:
         return adjusted, wrong
@@ -136,6 +147,27 @@ def _without_bars(
     wrong = wrong._replace(control=wrong.control & ~back[:, None])
     adjusted = adjust_rest(given, adjusted.as_start, wrong)
     return _test(given, adjusted, wrong, level)
+
+
+def _strange(block: MeasuredBlock, start: Start) -> Bool[np.ndarray, " ray"]:
+    """The rays of points that begin behind a photo, far off one of their rays, or at
+    another distance than all others. From there no step leads to where they are, and
+    those of other points go astray with them."""
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_quat(start.quaternions[:, [1, 2, 3, 0]]).as_matrix()
+    away = (start.points[block.point] - start.centres[block.photo])[:, :, None]
+    x, y, depth = (turns[block.photo] @ away)[:, :, 0].T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.stack([x / depth, y / depth]) - rays_of(block)[:, :2].T
+        usual = depth / np.nanmedian(depth)
+        strange = (
+            (usual < 1 / DISTANCE) | (usual > DISTANCE) | (np.hypot(*off) > ASTRAY)
+        )
+    points = np.zeros(len(block.points), bool)
+    points[block.point[strange]] = True
+    found = points[block.point]
+    return found if np.mean(found) < MOST else np.zeros(len(found), bool)
 
 
 def _test(

@@ -52,7 +52,7 @@ class _Point(NamedTuple):
     known_sigma: Float[np.ndarray, " known"]
 
     def cost(self, kept: Bool[np.ndarray, " ray"]) -> float:
-        """Ω of the rays that are kept."""
+        """Ω of the rays that are kept; infinite where they meet behind a photo."""
         if 2 * int(np.sum(kept)) + len(self.axes) <= 3:
             return 0.0
         at = self._meet(kept)
@@ -60,7 +60,14 @@ class _Point(NamedTuple):
             v, slopes = self._misfits(at, kept)
             at = at - np.linalg.lstsq(slopes, v, rcond=None)[0]
         v, _ = self._misfits(at, kept)
-        return float(np.sum(v**2))
+        return float(np.sum(v**2)) if self._is_ahead(at, kept) else np.inf
+
+    def _is_ahead(
+        self, at: Float[np.ndarray, "3"], kept: Bool[np.ndarray, " ray"]
+    ) -> bool:
+        """Whether a point lies in front of the photos of the rays that are kept."""
+        along = self.turns[kept, 2]
+        return bool(np.all(np.sum(along * (at - self.centres[kept]), axis=1) > 0))
 
     def is_determined(self, kept: Bool[np.ndarray, " ray"]) -> bool:
         """Whether the rays that are kept determine the point."""

@@ -328,3 +328,41 @@ def test_names_moved_by_one_row_on_a_photo_are_named(step):
     assert given.photos[2] in found.cause.sentence
     adjusted = found.adjusted
     assert adjusted.result == RESULTS.successful and not np.any(found.wrong.rays[own])
+
+
+def test_of_four_heights_in_the_corners_nothing_tells_which_is_wrong():
+    """Their twist is one misclosure; of a strip with more of them it is told."""
+    mock = block.mock_block(2, block.Flight(models=4), control_every=4)
+    at = mock.ground.coordinates.copy()
+    assert len(at) == 4
+    at[0, 2] += 5
+    corners = mock.ground._replace(coordinates=at)
+    found = orient_block(*block.pairs_of(mock.block), corners)
+    (sentence,) = found.contradictions
+    named = [name for name in mock.ground.points if name in sentence]
+    assert mock.ground.points[0] in named and len(named) > 1
+    more = block.mock_block(2, block.Flight(models=4), control_every=1)
+    at = more.ground.coordinates.copy()
+    at[3, 2] += 50
+    found = orient_block(
+        *block.pairs_of(more.block), more.ground._replace(coordinates=at)
+    )
+    assert not found.contradictions and found.cause is None
+    assert np.flatnonzero(np.any(found.wrong.control, axis=1)).tolist() == [3]
+
+
+def test_the_sign_of_a_coordinate_on_two_photos_throws_no_block_off():
+    """The rays meet behind the photos: the point is lost, and nothing else."""
+    mock = block.mock_block(5, block.Flight(models=4), control_every=2)
+    given = mock.block
+    photos = np.bincount(given.point)
+    names = np.array(given.points)[given.point]
+    ties = np.flatnonzero((photos[given.point] == 2) & (np.char.find(names, "t") == 0))
+    ray = ties[np.argmax(np.abs(given.x[ties]))]
+    x = given.x.copy()
+    x[ray] = -x[ray]
+    found = orient_block(*block.pairs_of(given._replace(x=x)), mock.ground)
+    assert found.adjusted.result == RESULTS.successful and found.wrong.settled
+    block_of = found.adjusted.block
+    out = {block_of.points[k] for k in block_of.point[found.wrong.rays]}
+    assert names[ray] in out and len(out) <= 2
