@@ -103,8 +103,8 @@ def _moved(block: MeasuredBlock, photo: int) -> list[Int[np.ndarray, " ray"]]:
 def _common(block: MeasuredBlock, one: int, other: int) -> Int[np.ndarray, "row 2"]:
     """The rays of two photos that show the same points."""
     rays = [np.flatnonzero(block.photo == photo) for photo in (one, other)]
-    points = [block.point[own] for own in rays]
-    _, *places = np.intersect1d(*points, return_indices=True)
+    left, right = (block.point[own] for own in rays)
+    _, *places = np.intersect1d(left, right, return_indices=True)
     return np.stack([own[k] for own, k in zip(rays, places, strict=True)], axis=1)
 
 
