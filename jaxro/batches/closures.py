@@ -112,7 +112,10 @@ def close(
     chosen = jax.tree.map(lambda a: np.asarray(a)[own], elements)
     part = choose(pairs, own, rows_of(pairs, own))
     root = joint_root(of_own(left), of_own(right), part, chosen, cofactor[own])
-    rotations, turns = (np.asarray(a) for a in _turns(chosen))
+    # repeated up to a power of two, so that tables of different lengths share a program
+    room = np.minimum(np.arange(1 << (len(own) - 1).bit_length()), len(own) - 1)
+    found = _turns(jax.tree.map(lambda a: a[room], chosen))
+    rotations, turns = (np.asarray(a)[: len(own)] for a in found)
     angles, design = _design(members, sides, rotations, turns)
     checked = np.where(checks > 0, sigma0[own] ** 2 * checks, 0.0)
     unit = 1.0 if sigma_known else np.sum(checked) / np.sum(checks)

@@ -26,6 +26,10 @@ UNITS = (
 """Heights in another unit than plan: the name of it, by what they are to be multiplied,
 and what to say."""
 
+FLAT, STEEP = 0.01, 0.1
+"""Times so small a factor heights are none, and any wrong height would be explained: it
+is tried where their range is larger than this part of the extent in plan."""
+
 EQUAL = 1e-6
 """Part of the extent in plan within which heights are all equal."""
 
@@ -118,6 +122,7 @@ def alter(coordinates: Known, rows: Rows, who: str) -> list[Altered]:
             lambda a, factor=factor: a * [1, 1, factor],
         )
         for name, factor, unit in UNITS
+        if factor > FLAT or _relief(at[rows]) > STEEP
     ]
     if _are_degrees(at[rows]):
         found += [
@@ -162,8 +167,13 @@ def _common_height(at: Known) -> float | None:
     heights = at[np.isfinite(at[:, 2]), 2]
     if len(heights) < FEWEST:
         return None
-    extent = np.max(np.nanmax(at[:, :2], axis=0) - np.nanmin(at[:, :2], axis=0))
-    return float(heights[0]) if np.ptp(heights) <= EQUAL * extent else None
+    return float(heights[0]) if _relief(at) <= EQUAL else None
+
+
+def _relief(at: Known) -> float:
+    """The range of the heights over the extent in plan."""
+    low, high = np.nanmin(at, axis=0), np.nanmax(at, axis=0)
+    return float((high - low)[2] / max(np.max((high - low)[:2]), 1e-300))
 
 
 def _are_degrees(at: Known) -> bool:

@@ -1,75 +1,103 @@
 """Known points one of which is wrong, and nothing tells which.
 
 Of four heights in the corners of a block one misclosure is left, its twist: each of them
-explains it. So each known point that was left out is put back, and others are left out in
-its place, each one adjustment: where everything fits as well, neither is accused.
+explains it. So each known point that was left out is put back, and those that then stand
+out as well are left out in its place, each one adjustment: where everything fits as well,
+neither is accused.
 """
 
-from itertools import islice
-
 import numpy as np
+from jaxtyping import Bool
 
 from ..adjustment import RESULTS
 from .adjust import BlockAdjustment
 from .adjust_chained import Outcome
-from .given import Given
+from .columns import Cause
+from .given import Given, Wrong
 from .place import TooLittleControl
 from .wrong import adjust_rest, normalise_residuals
 from .wrong_points import GAP
 
-MOST_TRIES = 24
-"""Adjustments at most."""
+CLEARLY = 4 * GAP
+"""By how much the sum of squares falls at least without a known point: below it the
+error is so small that it hardly matters which one is left out."""
+
+RELEVANT = 0.5
+"""Part of the largest w of all known points, while the one that was left out takes part,
+from which on another one may be wrong in its place."""
 
 
-def tell_confusable(given: Given, outcome: Outcome, level: float) -> tuple[str, ...]:
-    """A sentence for each set of known points that cannot be told apart."""
-    return tuple(
-        f"One of the known points {', '.join(names)} is wrong, and nothing tells which: "
-        "without any one of them everything fits. Measure more known points."
-        for names in find_confusable(given, outcome, level)
+def tell_confusable(given: Given, outcome: Outcome, level: float) -> Cause | None:
+    """The known points that cannot be told apart, in a sentence; None where there are
+    none."""
+    sets = find_confusable(given, outcome, level)
+    if not sets:
+        return None
+    told = "; and one of ".join(", ".join(names) for names in sets)
+    return Cause(
+        "confusable",
+        f"One of the known points {told} is wrong, and nothing tells which, as without "
+        "any one of them everything fits: measure more of them",
     )
 
 
 def find_confusable(given: Given, outcome: Outcome, level: float) -> list[list[str]]:
     """For each known point that was left out, itself or all its rays, and could be
     right: its name and those of the others without which everything fits as well."""
-    ground, adjusted, wrong = given.known, outcome.adjusted, outcome.wrong
-    if adjusted.result != RESULTS.successful:
+    if outcome.adjusted.result != RESULTS.successful:
         return []
-    number = ground.numbers_in(given.block)
-    there = np.any(np.isfinite(ground.coordinates), axis=1) & ~ground.check
-    there &= (number >= 0) & ~ground.station
-    fits = np.any(np.isfinite(adjusted.control_residuals), axis=1)
-    fits &= ~np.any(wrong.control, axis=1)
+    names = given.known.points
+    found = []
+    for k in np.flatnonzero(_left_out(given, outcome)).tolist():
+        if others := _instead(given, outcome, k, level):
+            found.append([names[k], *(names[j] for j in others)])
+    return found
 
-    def misfit(back: int, left: int) -> float:
-        """The misfit with one known point put back and another one left out; infinite
-        where it does not fit. The rays that come back have residuals, too."""
-        control = wrong.control.copy()
-        control[back], control[left] = False, True
-        rays = wrong.rays & (given.block.point != number[back])
-        try:
-            other = adjust_rest(
-                given,
-                adjusted.as_start,
-                wrong._replace(control=control, rays=rays),
-            )
-        except TooLittleControl:
-            return np.inf
-        expected = 2 * int(np.sum(wrong.rays & ~rays))
-        return _misfit(other) - expected if _fits(other, level) else np.inf
 
-    most = _misfit(adjusted) + GAP
-    swaps = (
-        (k, j)
-        for k in np.flatnonzero(there & ~fits)
-        for j in np.flatnonzero(there & fits)
-    )
-    found: dict[int, list[str]] = {}
-    for k, j in islice(swaps, MOST_TRIES):
-        if misfit(int(k), int(j)) <= most:
-            found.setdefault(int(k), [ground.points[k]]).append(ground.points[j])
-    return list(found.values())
+def _left_out(given: Given, outcome: Outcome) -> Bool[np.ndarray, " known"]:
+    """The known points that were left out as wrong, themselves or all their rays."""
+    ground, wrong, block = given.known, outcome.wrong, given.block
+    number = ground.numbers_in(block)
+    kept = np.bincount(block.point[~wrong.rays], minlength=len(block.points))
+    lost = np.bincount(block.point[wrong.rays], minlength=len(block.points))
+    without_rays = (kept[number] == 0) & (lost[number] > 0)
+    there = (number >= 0) & ~ground.check & ~ground.station
+    return there & (np.any(wrong.control, axis=1) | without_rays)
+
+
+def _instead(given: Given, outcome: Outcome, k: int, level: float) -> list[int]:
+    """The known points one of which may be wrong in place of the one that was left
+    out."""
+    ground, wrong = given.known, outcome.wrong
+    control = wrong.control.copy()
+    control[k] = False
+    rays = wrong.rays & (given.block.point != ground.numbers_in(given.block)[k])
+    back = wrong._replace(control=control, rays=rays)
+    # the rays that come back have residuals, too
+    most = _misfit(outcome.adjusted) + 2 * int(np.sum(wrong.rays & ~rays))
+    whole = _adjust(given, outcome, back)
+    if whole is None or _misfit(whole) < most + CLEARLY:
+        return []
+    w = np.max(np.nan_to_num(np.abs(normalise_residuals(whole).control)), axis=1)
+    w[ground.check | ground.station] = 0.0
+    others = np.flatnonzero(w >= RELEVANT * np.max(w))
+    found = []
+    for j in others[others != k].tolist():
+        control = back.control.copy()
+        control[j] = True
+        other = _adjust(given, outcome, back._replace(control=control))
+        if other is not None and _misfit(other) <= most + GAP and _fits(other, level):
+            found.append(j)
+    return found
+
+
+def _adjust(given: Given, outcome: Outcome, wrong: Wrong) -> BlockAdjustment | None:
+    """The adjustment with this left out; None where there is none."""
+    try:
+        found = adjust_rest(given, outcome.adjusted.as_start, wrong)
+    except TooLittleControl:
+        return None
+    return found if found.result == RESULTS.successful else None
 
 
 def _misfit(adjusted: BlockAdjustment) -> float:
@@ -79,7 +107,5 @@ def _misfit(adjusted: BlockAdjustment) -> float:
 
 def _fits(adjusted: BlockAdjustment, level: float) -> bool:
     """Whether no known point stands out."""
-    if adjusted.result != RESULTS.successful:
-        return False
     tested = normalise_residuals(adjusted, level)
     return bool(np.max(np.nan_to_num(np.abs(tested.control)), initial=0) < tested.limit)

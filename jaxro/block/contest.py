@@ -22,12 +22,12 @@ from .adjust import BlockAdjustment
 from .adjust_chained import Outcome, adjust_chained
 from .bars import differences
 from .chain import Chained
-from .columns import EQUAL_HEIGHTS, UNCERTAIN, Altered, Cause, alter
+from .columns import EQUAL_HEIGHTS, UNCERTAIN, Altered, Cause, Known, alter
 from .contradictions import contradictions
 from .given import Given
 from .inner import Inner
 from .measured_block import Ground
-from .place import TooLittleControl, known_in_chain, place, similarities
+from .place import TooLittleControl, known_in_chain, place_known, similarities
 from .wrong import CLEAR
 
 CUT = CLEAR**2
@@ -176,12 +176,13 @@ def _of_ground(given: Given, chained: Chained, most: float = 1.0) -> list[Hypoth
     for rows, who in groups:
         for one in alter(ground.coordinates, rows, who):
             tried.append((_known_by(ground, one), one.name, one.sentence))
-    if (shifted := _shift_stations(given, chained)) is not None:
+    model = known_in_chain(given.block, chained, ground)
+    if (shifted := _shift_stations(ground, model)) is not None:
         tried.append(shifted)
-    limit = most * _misplaced(given, chained, ground)
+    limit = most * _misplaced(model, ground)
     # what is unknown does not show in where a block is placed
     sizes = [
-        0.0 if name == EQUAL_HEIGHTS else _misplaced(given, chained, changed)
+        0.0 if name == EQUAL_HEIGHTS else _misplaced(model, changed)
         for changed, name, _ in tried
     ]
     order = np.argsort(sizes, kind="stable")[:TRIED]
@@ -205,22 +206,21 @@ def _known_by(ground: Ground, altered: Altered) -> Ground:
     return ground._replace(coordinates=altered.coordinates, sigma=sigma)
 
 
-def _misplaced(given: Given, chained: Chained, ground: Ground) -> float:
-    """How far known points are from the placed block: the mean root of their distances,
-    which few wrong ones hardly change; infinite where they do not place it."""
+def _misplaced(model: Known, ground: Ground) -> float:
+    """How far known points are from the placed block, by where they are in the chained
+    one: the mean root of their distances, which few wrong ones hardly change; infinite
+    where they do not place it."""
     try:
-        apart = place(given.block, chained, ground).apart
+        apart = place_known(model, ground).apart
     except TooLittleControl:
         return np.inf
     return float(np.mean(np.sqrt(apart[np.isfinite(apart)])))
 
 
-def _shift_stations(given: Given, chained: Chained) -> tuple[Ground, str, str] | None:
+def _shift_stations(ground: Ground, model: Known) -> tuple[Ground, str, str] | None:
     """The ground with all stations shifted as their differences from the known points
     say. Points and stations, each about their middle, tell rotation and scale."""
-    ground = given.known
     whole = np.all(np.isfinite(ground.coordinates), axis=1) & ~ground.check
-    model = known_in_chain(given.block, chained, ground)
     use = whole & np.all(np.isfinite(model), axis=1)
     sets = [np.flatnonzero(use & which) for which in (~ground.station, ground.station)]
     if any(len(rows) == 0 for rows in sets) or sum(map(len, sets)) < 4:

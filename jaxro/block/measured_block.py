@@ -144,6 +144,29 @@ def from_pairs(
     return check_names(without_copies(block))
 
 
+def pairs_of_rays(
+    block: MeasuredBlock,
+    begins: Int[np.ndarray, " ends"],
+    one: Int[np.ndarray, " row"],
+    other: Int[np.ndarray, " row"],
+    left: Int[np.ndarray, " pair"],
+    right: Int[np.ndarray, " pair"],
+) -> Ragged:
+    """Pairs of the photos `left` and `right`, whose rows are the rays `one` and `other`
+    of their points; pair k has the rows begins[k] to begins[k + 1]."""
+    return Ragged(
+        begins=begins,
+        x_left=block.x[one],
+        y_left=block.y[one],
+        x_right=block.x[other],
+        y_right=block.y[other],
+        sigma=np.maximum(block.sigma[one], block.sigma[other]),
+        mask=np.ones(len(one), bool),
+        focal_left=block.focal[left],
+        focal_right=block.focal[right],
+    )
+
+
 def without_copies(block: MeasuredBlock) -> MeasuredBlock:
     """The block with each place once: of places of a point on a photo that differ by a
     small part of their standard deviation, the first one."""

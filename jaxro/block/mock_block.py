@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..batches.ragged import Ragged
 from .chain import Chained
-from .measured_block import Ground, MeasuredBlock, ground
+from .measured_block import Ground, MeasuredBlock, ground, pairs_of_rays
 
 
 class Flight(NamedTuple):
@@ -137,17 +137,7 @@ def pairs_of(
     one, other, pair = one[by_pair], other[by_pair], pair[by_pair]
     begins = np.searchsorted(pair, np.arange(len(order) + 1))
     left, right = block.photo[one[begins[:-1]]], block.photo[other[begins[:-1]]]
-    pairs = Ragged(
-        begins=begins,
-        x_left=block.x[one],
-        y_left=block.y[one],
-        x_right=block.x[other],
-        y_right=block.y[other],
-        sigma=np.maximum(block.sigma[one], block.sigma[other]),
-        mask=np.ones(len(one), bool),
-        focal_left=block.focal[left],
-        focal_right=block.focal[right],
-    )
+    pairs = pairs_of_rays(block, begins, one, other, left, right)
     name = lambda numbers: [block.photos[k] for k in numbers]
     return name(left), name(right), pairs, [block.points[k] for k in block.point[one]]
 

@@ -1,9 +1,10 @@
 """A photo on which each place has the name of the row before or after it.
 
 Such a photo fits no other one, and no place of it is worse than the rest. Under each
-hypothesis, the names moved by one row of the list in which they came, or of the list by name, the
-pairs of the photo are oriented anew: where nearly all of their points fit then, and few
-did before, the names are the cause. Of places in a list of no order nothing is found.
+hypothesis the names are moved by one row, of the list in which they came or of the list
+by name, and the pairs of the photo are oriented anew: where nearly all of their points
+fit then, and few did before, the names are the cause. Of places in a list of no order
+nothing is found.
 """
 
 import re
@@ -16,13 +17,14 @@ from jaxtyping import Int, Shaped
 
 from ..batches.ragged import Ragged
 from .chain import Oriented
-from .measured_block import MeasuredBlock
+from .measured_block import MeasuredBlock, pairs_of_rays
 
 FEW = 0.5
 """Part of the points of a photo's pairs up to which its names may be wrong."""
 
 NEARLY_ALL = 0.8
-"""Part of them that has to fit when the names are moved."""
+"""Part of them that has to fit when the names are moved; and part of the points of a
+refused pair with which it joins photos that nothing else joins."""
 
 FEWEST = 8
 """Points of its pairs that can tell."""
@@ -58,10 +60,13 @@ def find_moved(
             moved = block._replace(point=names)
             ends = zip(left[own].tolist(), right[own].tolist(), strict=True)
             rows = [_common(moved, one, other) for one, other in ends]
-            points = sum(map(len, rows))
-            found = orient(_pairs(moved, left[own], right[own], rows))
+            begins = np.cumsum([0, *map(len, rows)])
+            rays = np.concatenate(rows).T
+            pairs = pairs_of_rays(moved, begins, *rays, left[own], right[own])
+            found = orient(pairs)
             fitting = int(np.sum(np.where(found.usable, found.kept, 0)))
-            if points >= FEWEST and fitting > NEARLY_ALL * points:
+            points = len(rays[0])
+            if fitting > NEARLY_ALL * points:
                 every = _replace(oriented, own, found)
                 return Moved(block.photos[photo], moved, every, fitting, points)
     return None
@@ -79,6 +84,7 @@ def _suspects(
     of_photo = lambda a: np.bincount(left, a, photos) + np.bincount(right, a, photos)
     with np.errstate(invalid="ignore"):
         part = of_photo(fitting) / of_photo(points)
+    part = np.where(of_photo(points) >= FEWEST, part, np.inf)
     worst = np.argsort(part, kind="stable")[:TRIED]
     return worst[part[worst] <= FEW].tolist()
 
@@ -106,27 +112,6 @@ def _common(block: MeasuredBlock, one: int, other: int) -> Int[np.ndarray, "row 
     left, right = (block.point[own] for own in rays)
     _, *places = np.intersect1d(left, right, return_indices=True)
     return np.stack([own[k] for own, k in zip(rays, places, strict=True)], axis=1)
-
-
-def _pairs(
-    block: MeasuredBlock,
-    left: Int[np.ndarray, " pair"],
-    right: Int[np.ndarray, " pair"],
-    rows: list[Int[np.ndarray, "_ 2"]],
-) -> Ragged:
-    """The pairs of these rays."""
-    one, other = np.concatenate(rows).T
-    return Ragged(
-        begins=np.cumsum([0, *map(len, rows)]),
-        x_left=block.x[one],
-        y_left=block.y[one],
-        x_right=block.x[other],
-        y_right=block.y[other],
-        sigma=np.maximum(block.sigma[one], block.sigma[other]),
-        mask=np.ones(len(one), bool),
-        focal_left=block.focal[left],
-        focal_right=block.focal[right],
-    )
 
 
 def _replace(

@@ -23,12 +23,8 @@ from .contradictions import contradictions, is_suspicious, stands_under_ground
 from .given import Given, Wrong
 from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, from_pairs
-from .moved_names import find_moved
+from .moved_names import NEARLY_ALL, find_moved
 from .place import Placed, TooLittleControl
-
-NEARLY_ALL = 0.8
-"""Part of the points of a refused pair that fit, with which it may join photos that
-nothing else joins."""
 
 
 class OrientedBlock(NamedTuple):
@@ -118,7 +114,7 @@ def adjust_and_judge(
             outcome.adjusted
         )
         if not (suspicious or of_ground or is_misplaced(given, chained)):
-            return Judged(outcome, tell_confusable(given, outcome, level))
+            return Judged(outcome, cause=tell_confusable(given, outcome, level))
     cause, explained = _of_field(given), None
     if cause is None:
         found = find_cause(
@@ -139,7 +135,7 @@ def adjust_and_judge(
     if cause is not None and cause.name in OF_MEASUREMENT and not against:
         cause = cause._replace(is_hint=True)
     if cause is None and not against:
-        return Judged(outcome, tell_confusable(given, outcome, level))
+        cause = tell_confusable(given, outcome, level)
     return Judged(outcome, tuple(against), cause)
 
 
@@ -184,8 +180,8 @@ def join_pairs(
         chained = chain(block, models_of(*ends, oriented))
     except Unjoined:
         # approximate values need no verdict, and the block is judged as a whole
-        oriented = oriented._replace(usable=_nearly_usable(oriented))
-        chained = chain(block, models_of(*ends, oriented))
+        more = oriented._replace(usable=_nearly_usable(oriented))
+        chained = chain(block, models_of(*ends, more))
     return Joined(block, chained, np.asarray(oriented.usable), cause)
 
 

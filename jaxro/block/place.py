@@ -58,7 +58,13 @@ def place(
 ) -> Placed:
     """The similarity that takes a chained block to its known points. Raises
     `TooLittleControl`."""
-    model = known_in_chain(block, chained, ground)
+    return place_known(known_in_chain(block, chained, ground), ground, seed)
+
+
+def place_known(
+    model: Float[np.ndarray, "known 3"], ground: Ground, seed: int = 0
+) -> Placed:
+    """The same from where the known points are in the chained block."""
     at = np.where(ground.check[:, None], np.nan, ground.coordinates)
     whole = np.flatnonzero(np.all(np.isfinite(model) & np.isfinite(at), axis=1))
     if len(whole) < 3:

@@ -338,8 +338,8 @@ def test_of_four_heights_in_the_corners_nothing_tells_which_is_wrong():
     at[0, 2] += 5
     corners = mock.ground._replace(coordinates=at)
     found = orient_block(*block.pairs_of(mock.block), corners)
-    (sentence,) = found.contradictions
-    named = [name for name in mock.ground.points if name in sentence]
+    assert found.cause is not None and found.cause.name == "confusable"
+    named = [name for name in mock.ground.points if name in found.cause.sentence]
     assert mock.ground.points[0] in named and len(named) > 1
     more = block.mock_block(2, block.Flight(models=4), control_every=1)
     at = more.ground.coordinates.copy()
