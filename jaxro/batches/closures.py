@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..adjustment import critical_values as critical
 from ..geometry import rotations as rot
 from ..geometry.elements import AbstractElements
 from ..orientation.model_errors import root as lower_root
@@ -99,8 +100,6 @@ def close(
     sigma_known: bool,
 ) -> Closures | None:
     """The same of the columns of an orientation."""
-    from scipy.stats import chi2, f
-
     usable = usable & np.all(np.isfinite(lower_root(cofactor)), axis=(1, 2))
     photos, members, sides = _find_triplets(left, right, usable)
     checks = freedom[np.unique(members)]
@@ -128,9 +127,11 @@ def close(
     squares = np.nan_to_num(squares)
     degrees = total**2 / float(np.sum(agree.data**2))
     ratio = float(np.sum(squares) / unit / total)
-    law = chi2(degrees, scale=1 / degrees)
-    if not sigma_known:
-        law = f(degrees, np.sum(checks))
+    chance = (
+        critical.chi_squared_p(degrees * ratio, degrees)
+        if sigma_known
+        else critical.fisher_p(ratio, degrees, np.sum(checks))
+    )
     return Closures(
         photos=photos,
         pairs=own[members],
@@ -138,7 +139,7 @@ def close(
         squares=squares / unit,
         ratio=ratio,
         freedom=degrees,
-        probability=float(law.sf(ratio)),
+        probability=float(chance),
     )
 
 

@@ -303,11 +303,12 @@ def may_be_chance(deviation: float, freedom: int) -> bool:
     """Whether a layout of this largest deviation (rad), by a sigma0 of so many degrees
     of freedom, may have been accepted as sigma0 is small by chance, of a thousand once.
     Pairs of `FEW` are judged by what is expected before the measurement."""
-    from scipy.stats import chi2
-
     if freedom <= FEW:
         return False
-    return deviation * math.sqrt(freedom / chi2.ppf(RARE, freedom)) > WEAK
+    return (
+        deviation * math.sqrt(freedom / critical_values.chi_squared(1 - RARE, freedom))
+        > WEAK
+    )
 
 
 def _chosen_by_sigma0(one: One) -> list[str]:
