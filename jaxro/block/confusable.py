@@ -1,13 +1,12 @@
 """Known points one of which is wrong, and nothing tells which.
 
 Of four heights in the corners of a block one misclosure is left, its twist: each of them
-explains it. So each known point that was left out is put back, and those that then stand
-out as well are left out in its place, each one adjustment: where everything fits as well,
+explains it. So what was left out of the known points is put back, and those that then
+stand out are left out in its place, each one adjustment: where everything fits as well,
 neither is accused.
 """
 
 import numpy as np
-from jaxtyping import Bool
 
 from ..adjustment import RESULTS
 from .adjust import BlockAdjustment
@@ -42,50 +41,62 @@ def tell_confusable(given: Given, outcome: Outcome, level: float) -> Cause | Non
 
 
 def find_confusable(given: Given, outcome: Outcome, level: float) -> list[list[str]]:
-    """For each known point that was left out, itself or all its rays, and could be
-    right: its name and those of the others without which everything fits as well."""
+    """Sets of known points of which one is wrong, and nothing tells which: those of all
+    that lost anything, in place of a single one that is wrong; else those of each point
+    that was left out."""
     if outcome.adjusted.result != RESULTS.successful:
         return []
     names = given.known.points
-    found = []
-    for k in np.flatnonzero(_left_out(given, outcome)).tolist():
-        if others := _instead(given, outcome, k, level):
-            found.append([names[k], *(names[j] for j in others)])
-    return found
+    out, touched = _left_out(given, outcome)
+    if not len(out):
+        return []
+    if len(touched) > 1:
+        alone = _alone(given, outcome, touched, level)
+        if len(alone) > 1:
+            return [[names[j] for j in alone]]
+    found = [_alone(given, outcome, [k], level) for k in out]
+    return [[names[j] for j in alone] for alone in found if len(alone) > 1]
 
 
-def _left_out(given: Given, outcome: Outcome) -> Bool[np.ndarray, " known"]:
-    """The known points that were left out as wrong, themselves or all their rays."""
+def _left_out(given: Given, outcome: Outcome) -> tuple[list[int], list[int]]:
+    """The known points that were left out as wrong, themselves or all their rays; and
+    those that lost anything."""
     ground, wrong, block = given.known, outcome.wrong, given.block
     number = ground.numbers_in(block)
-    kept = np.bincount(block.point[~wrong.rays], minlength=len(block.points))
-    lost = np.bincount(block.point[wrong.rays], minlength=len(block.points))
-    without_rays = (kept[number] == 0) & (lost[number] > 0)
+    kept = np.bincount(block.point[~wrong.rays], minlength=len(block.points))[number]
+    lost = np.bincount(block.point[wrong.rays], minlength=len(block.points))[number]
     there = (number >= 0) & ~ground.check & ~ground.station
-    return there & (np.any(wrong.control, axis=1) | without_rays)
+    itself = np.any(wrong.control, axis=1)
+    out = there & (itself | ((kept == 0) & (lost > 0)))
+    touched = there & (itself | (lost > 0))
+    return np.flatnonzero(out).tolist(), np.flatnonzero(touched).tolist()
 
 
-def _instead(given: Given, outcome: Outcome, k: int, level: float) -> list[int]:
-    """The known points one of which may be wrong in place of the one that was left
-    out."""
+def _alone(given: Given, outcome: Outcome, back: list[int], level: float) -> list[int]:
+    """The known points without any one of which everything fits, where those that were
+    left out are put back and fit no more; those first."""
     ground, wrong = given.known, outcome.wrong
     control = wrong.control.copy()
-    control[k] = False
-    rays = wrong.rays & (given.block.point != ground.numbers_in(given.block)[k])
-    back = wrong._replace(control=control, rays=rays)
+    control[back] = False
+    numbers = ground.numbers_in(given.block)[back]
+    rays = wrong.rays & ~np.isin(given.block.point, numbers)
+    together = wrong._replace(control=control, rays=rays)
     # the rays that come back have residuals, too
     most = _misfit(outcome.adjusted) + 2 * int(np.sum(wrong.rays & ~rays))
-    whole = _adjust(given, outcome, back)
+    whole = _adjust(given, outcome, together)
     if whole is None or _misfit(whole) < most + CLEARLY:
         return []
     w = np.max(np.nan_to_num(np.abs(normalise_residuals(whole).control)), axis=1)
     w[ground.check | ground.station] = 0.0
-    others = np.flatnonzero(w >= RELEVANT * np.max(w))
+    others = np.flatnonzero(w >= RELEVANT * np.max(w)).tolist()
     found = []
-    for j in others[others != k].tolist():
-        control = back.control.copy()
+    for j in dict.fromkeys([*back, *others]):
+        if back == [j]:
+            found.append(j)
+            continue
+        control = together.control.copy()
         control[j] = True
-        other = _adjust(given, outcome, back._replace(control=control))
+        other = _adjust(given, outcome, together._replace(control=control))
         if other is not None and _misfit(other) <= most + GAP and _fits(other, level):
             found.append(j)
     return found

@@ -23,6 +23,7 @@ from .adjust_chained import Outcome, adjust_chained
 from .bars import differences
 from .chain import Chained
 from .columns import EQUAL_HEIGHTS, UNCERTAIN, Altered, Cause, Known, alter
+from .confusable import tell_confusable
 from .contradictions import contradictions
 from .given import Given
 from .inner import Inner
@@ -65,7 +66,7 @@ class Hypothesis(NamedTuple):
     @property
     def of_ground(self) -> bool:
         """Whether it is about what is known, and not about how it was measured."""
-        return self.unknowns == 0
+        return self.name not in OF_MEASUREMENT
 
 
 def find_cause(
@@ -83,7 +84,7 @@ def find_cause(
     compile programs of their own."""
     usual = np.inf if outcome is None else _deviance(given, outcome, 0, 1.0)
     best, found = usual - MARGIN, None
-    for one in _hypotheses(given, chained, outcome, sigma_known, ground_alone):
+    for one in _hypotheses(given, chained, outcome, level, sigma_known, ground_alone):
         tried = _adjust(one.given, chained, level)
         if tried is None or tried.adjusted.result != RESULTS.successful:
             continue
@@ -147,6 +148,7 @@ def _hypotheses(
     given: Given,
     chained: Chained,
     outcome: Outcome | None,
+    level: float,
     sigma_known: bool,
     ground_alone: bool,
 ) -> Iterator[Hypothesis]:
@@ -155,6 +157,7 @@ def _hypotheses(
     yield from _of_bars(given, outcome)
     if ground_alone:
         return
+    yield from _of_single_points(given, chained, level)
     yield from _of_cameras(given)
     if outcome is not None and sigma_known:
         yield from _of_sigma(given, outcome)
@@ -241,6 +244,52 @@ def _shift_stations(ground: Ground, model: Known) -> tuple[Ground, str, str] | N
         "Known points and known stations contradict each other by a common shift of "
         f"about ({told}) in X, Y, Z; without it everything fits. Neither is called wrong: "
         "look at height systems (ellipsoidal or above the sea) and datums",
+    )
+
+
+def _of_single_points(
+    given: Given, chained: Chained, level: float
+) -> Iterator[Hypothesis]:
+    """One known point that is wrong: of few ones it bends the block, and takes the others
+    with it. Those are tried without which the others are best placed."""
+    ground = given.ground
+    if ground is None:
+        return
+    own = ~ground.check & ~ground.station
+    rows = np.flatnonzero(own & np.any(np.isfinite(ground.coordinates), axis=1))
+    model = known_in_chain(given.block, chained, ground)
+    without = {int(k): _without(ground, k) for k in rows}
+    sizes = {k: _misplaced(model, left) for k, left in without.items()}
+    for k in sorted(sizes, key=lambda k: sizes[k])[:TRIED]:
+        if np.isfinite(sizes[k]):
+            yield Hypothesis(
+                "known_point",
+                given._replace(ground=without[k]),
+                lambda found, k=k: _say_single(given, found, k, level),
+                unknowns=int(np.sum(np.isfinite(ground.coordinates[k]))),
+            )
+
+
+def _without(ground: Ground, k: int) -> Ground:
+    """The ground without the coordinates of one of its points."""
+    coordinates = ground.coordinates.copy()
+    coordinates[k] = np.nan
+    return ground._replace(coordinates=coordinates)
+
+
+def _say_single(given: Given, found: Outcome, k: int, level: float) -> str:
+    """That one known point is wrong, or which ones cannot be told apart."""
+    control = found.wrong.control.copy()
+    control[k] = np.isfinite(given.known.coordinates[k])
+    left_out = found._replace(wrong=found.wrong._replace(control=control))
+    confusable = tell_confusable(given, left_out, level)
+    if confusable is not None:
+        return confusable.sentence
+    off, _ = found.adjusted.compare(given.known)
+    told = ", ".join(f"{-value:.3g}" for value in off[k])
+    return (
+        f"Without the known point {given.known.points[k]} everything fits; its "
+        f"coordinates are off by ({told}) in X, Y, Z"
     )
 
 

@@ -7,7 +7,7 @@ from ..adjustment import critical_values as critical
 from ..block.absolute_result import NAMES
 from ..block.absolute_verdict import RESULTS, advice_of
 from .absolute_files import Done
-from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
+from .control import AXES, CONTRADICTED, add_rows, in_words, kinds_in_words, show_checks
 from .pair import digits, join_names, table
 from .reliability import DOUBTFUL
 from .rows import left_out
@@ -15,12 +15,6 @@ from .text import escape, number, say
 
 POORLY = 0.1
 """Redundancy below which a control coordinate is said to be poorly checked."""
-
-CONTRADICTED = (
-    " Look at names, axes, units and coordinate systems of the control, and at the "
-    "model."
-)
-"""What is to be done about a model that its control contradicts."""
 
 SHOWN = 10
 """Names that a sentence tells of a longer list."""

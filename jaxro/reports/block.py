@@ -9,16 +9,10 @@ from ..tables.fields import tell
 from .block_files import ANGLES
 from .block_model import Done
 from .block_sentences import SHOWN, sentences
-from .control import AXES, add_rows, in_words, kinds_in_words, show_checks
+from .control import AXES, CONTRADICTED, add_rows, in_words, kinds_in_words, show_checks
 from .pair import digits, table
 from .rows import left_out, most_rows, worst
 from .text import escape, number
-
-CONTRADICTED = (
-    " So much is no single error, and no cause that was tried explains it: look at names, "
-    "axes, units and coordinate systems, and at the camera."
-)
-"""What is to be done about a block that what is known contradicts."""
 
 
 def show(console: Console, done: Done) -> None:

@@ -13,6 +13,12 @@ from .pair import digits, table
 from .rows import left_out, worst
 from .text import escape, number
 
+CONTRADICTED = (
+    " No cause that was tried explains it: look at names, axes, units and coordinate "
+    "systems of what is known, and at the camera."
+)
+"""What is to be done where what is known contradicts the photos."""
+
 AXES = ("X", "Y", "Z")
 LEVEL = 0.05
 """Probability that any check coordinate exceeds its limit although none is wrong."""
