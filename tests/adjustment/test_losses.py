@@ -114,6 +114,7 @@ def test_orientation_is_the_minimum_of_the_written_out_objective(loss):
         assert away(x) < 0.1 * away(squares)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loss",
     [

@@ -163,6 +163,7 @@ def cleaned(points, size, trials, procedure=SNOOPING, layout=layout):
     return pairs, ~np.asarray(kept), np.asarray(doubted), wrong, pose
 
 
+@pytest.mark.slow
 def test_where_nothing_tells_the_points_apart_none_is_rejected():
     """An error in one of the four points that stand alone in their zones: all four are
     named, and no other."""

@@ -164,6 +164,7 @@ def test_too_few_points_are_no_layout(criterion, points, kept):
         )
 
 
+@pytest.mark.slow
 def test_accuracy_is_that_of_the_textbook():
     (x, y), lanes = random_positions(1), (37, 9)
     pair = design.photograph(box(TILTED, hills), (x, y), SIGMA)
@@ -217,6 +218,7 @@ def test_symmetries():
     np.testing.assert_allclose(level()(SIDE - x, y)[:3], here[:3], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_an_error_of_the_detectable_size_moves_its_test_by_delta0():
     """Re-adjusted with the error planted in one y coordinate of a flawless pair: |w| =
     delta0, to first order."""

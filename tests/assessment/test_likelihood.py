@@ -72,6 +72,7 @@ def oracle(pair, bx):
     return residuals
 
 
+@pytest.mark.slow
 def test_the_ends_are_those_of_a_search():
     """At an end of the interval of an element the misfit cannot be less than the limit,
     whatever the other elements are."""
@@ -119,6 +120,7 @@ def test_the_region_and_its_numbers_do_not_depend_on_the_elements():
     np.testing.assert_allclose(*map(np.concatenate, told), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_small_errors_leave_the_deviations():
     """Of errors a thousand times smaller S is its parabola, and the interval by
     likelihood that by Student's t."""
@@ -150,6 +152,7 @@ def test_what_has_no_sigma0_has_no_end():
     assert bool(likelihood.region_holds(pair, found, truth))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [6, 7])
 @pytest.mark.parametrize(
     "count", [FEW, pytest.param(4000, marks=pytest.mark.slow)], ids=["few", "many"]

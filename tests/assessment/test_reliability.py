@@ -396,6 +396,7 @@ def test_an_orientation_that_is_not_usable_is_not_read():
     )
 
 
+@pytest.mark.slow
 def test_derivatives():
     """Of everything finite, by every coordinate at fixed elements; with masked points
     and exactly vertical photos."""

@@ -101,6 +101,7 @@ def along(by, direction):
     return jax.tree.map(lambda *d: sum(d), *parts)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_nonlinear_adjustment():
     """Central differences of the converged solution, extrapolated to step zero, to
     1e-6."""

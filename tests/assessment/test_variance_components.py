@@ -120,6 +120,7 @@ def test_both_photos_of_convergent_pairs():
     np.testing.assert_allclose(result.pooled**2, (SMALL**2 + LARGE**2) / 2, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_y_of_left_and_right_photo():
     """In convergent pairs y of both photos; x, which hardly enters, in a group of its
     own and told to be unknown."""
@@ -216,6 +217,7 @@ def test_restricted_likelihood_is_largest():
     np.testing.assert_allclose(result.sigma, np.exp(best.x / 2), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_repetition():
     """A hundred times twenty pairs: the estimates scatter as their standard errors
     say."""

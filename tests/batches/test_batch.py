@@ -15,6 +15,7 @@ import numpy as np
 import problems
 import pytest
 from mock_photos import FOCAL, block, photographed
+from tiers import seldom
 
 import jaxro
 from jaxro import DependentElements
@@ -295,6 +296,9 @@ def derivative(pairs):
     return problems.jit(jax.grad(total, allow_int=True)).lower(pairs).compile()
 
 
+PROGRAMS = seldom(["loop", "derivative"], ["loop"])
+
+
 @pytest.mark.slow
 def test_derivatives_of_a_batch_are_differences(pairs, loop, derivative):
     """Of pairs in any position among near-vertical ones, by the fourth point."""
@@ -313,7 +317,8 @@ def test_derivatives_of_a_batch_are_differences(pairs, loop, derivative):
     )
 
 
-def test_a_failing_neighbour_changes_no_bit(pairs, loop, derivative):
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_a_failing_neighbour_changes_no_bit(pairs, loop, name, request):
     """Neither of an orientation nor of a derivative."""
     bad = [
         photographed(block(POINTS), base=(0.0, 0.0, 0.0)),
@@ -328,10 +333,10 @@ def test_a_failing_neighbour_changes_no_bit(pairs, loop, derivative):
         lambda a, new: jnp.concatenate([a[:begin], new]), pairs, jaxro.stack(bad)
     )
     assert not np.any(loop(among).usable[begin:])
-    for program in (loop, derivative):
-        alone, beside = program(pairs), program(among)
-        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(beside), strict=True):
-            np.testing.assert_array_equal(np.asarray(a)[:begin], np.asarray(b)[:begin])
+    program = request.getfixturevalue(name)
+    alone, beside = program(pairs), program(among)
+    for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(beside), strict=True):
+        np.testing.assert_array_equal(np.asarray(a)[:begin], np.asarray(b)[:begin])
 
 
 def test_a_batch_takes_little_memory(loop, pairs):
@@ -340,14 +345,14 @@ def test_a_batch_takes_little_memory(loop, pairs):
     assert loop.memory_analysis().temp_size_in_bytes < 150 * 40e3
 
 
-def test_no_lapack_in_the_batch_path(loop, derivative):
-    programs = (loop, set()), (derivative, {"xla_ffi_python_cpu_callback"})
-    for program, allowed in programs:
-        text = program.as_text()
-        assert set(re.findall(r'custom_call_target="([^"]+)"', text)) <= allowed
-        assert "while" in text and not re.search(
-            r"= \S+ (cholesky|triangular-solve)\(", text
-        )
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_no_lapack_in_the_batch_path(name, request):
+    allowed = {"loop": set(), "derivative": {"xla_ffi_python_cpu_callback"}}[name]
+    text = request.getfixturevalue(name).as_text()
+    assert set(re.findall(r'custom_call_target="([^"]+)"', text)) <= allowed
+    assert "while" in text and not re.search(
+        r"= \S+ (cholesky|triangular-solve)\(", text
+    )
 
 
 def test_the_general_start_runs_only_where_a_pair_needs_it(loop):

@@ -68,6 +68,7 @@ def fly(rng, shares, points, lens=0.0, sigma=SIGMA):
     return left, right, pairs
 
 
+@pytest.mark.slow
 def test_cofactors_are_those_of_moved_measurements():
     """A place that is moved moves the elements of all pairs that have it, as the root
     of the joint cofactors says; of one pair the cofactors are its own."""
@@ -100,6 +101,7 @@ def test_cofactors_are_those_of_moved_measurements():
     assert np.min(gap) < 0.005 * np.max(np.abs(slope))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_known", [True, False])
 def test_triplets_close_as_their_joint_covariance_says(sigma_known):
     """95 % of the closures are inside 95 %, whether pairs share all, half or none of

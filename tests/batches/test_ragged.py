@@ -75,6 +75,7 @@ def test_ragged_equals_one_by_one(pairs, together):
                 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("length", "size"), [(8, 8), (7, 8), pytest.param(8, 12, marks=pytest.mark.slow)]
 )

@@ -164,6 +164,7 @@ def test_a_difference_of_points(strip):
     np.testing.assert_allclose(apart.distance_deviation, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [False, True])
 def test_derivatives_are_those_of_the_finished_adjustment(free):
     """By adjusting changed measurements anew; first-order influences would be wrong by

@@ -174,6 +174,7 @@ def test_scale_bars_are_those_of_a_dense_update():
     np.testing.assert_allclose(same.bar_redundancy, 1, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_bars_without_weight_leave_the_cameras_what_they_are():
     """Values and deviations: the ends of the bars are common unknowns beside them."""
     mock = block.mock_block(7, Flight(models=3))

@@ -83,6 +83,7 @@ def strasbourg(data):
     return measured, known, published
 
 
+@pytest.mark.slow
 def test_a_published_block(strasbourg):
     """From its pairs alone, without start values. The published program has one point
     with a single ray and shifts the control by an amount that is not published."""
@@ -290,6 +291,7 @@ def test_a_place_is_one_measurement_however_it_comes_in(moved, new):
     np.testing.assert_array_equal(more.x[: len(found.x)], found.x)
 
 
+@pytest.mark.slow
 def test_swapped_names_in_a_hundred_blocks():
     """Chained from their pairs, without wrong ties."""
     hits = 0
@@ -315,6 +317,7 @@ def test_swapped_names_in_a_hundred_blocks():
     assert hits >= 95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [1, -1])
 def test_names_moved_by_one_row_on_a_photo_are_named(step):
     """Each place of a photo has the name of the row before, or of the next one."""
@@ -330,6 +333,7 @@ def test_names_moved_by_one_row_on_a_photo_are_named(step):
     assert adjusted.result == RESULTS.successful and not np.any(found.wrong.rays[own])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "row, axis, error, cause, told",
     [

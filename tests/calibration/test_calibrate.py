@@ -79,6 +79,7 @@ def oracle(points, places, zones_x, zones_y):
     return residuals, count + (0 if of_y is None else of_y.max() + 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

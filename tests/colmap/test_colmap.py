@@ -201,6 +201,7 @@ def test_other_tables_stay_and_geometries_are_not_overwritten(scene, tmp_path):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("copied", [False, True])
 def test_all_or_none(copied, scene, tmp_path, monkeypatch):
     own = tmp_path / "own.db"

@@ -312,9 +312,10 @@ HEADER = "pair,point,x_left,y_left,x_right,y_right\n"
             lambda pairs, ground: (pairs, "point,X,Y,Z\nc0,1,2,3\n"),
             "found no standard deviations",
         ),
-        (
+        pytest.param(
             lambda pairs, ground: (pairs, keep(ground, "c0", "c5")),
             "Missing: tilt (heights of three points that are not on one line)",
+            marks=pytest.mark.slow,
         ),
         (
             lambda pairs, ground: (pairs, minimal(ground)),

@@ -46,6 +46,7 @@ def files(folder, film):
     )
 
 
+@pytest.mark.slow
 def test_few_points_leave_no_choice_and_a_contradiction_is_not_usable(tmp_path):
     """Four points and a known camera: residuals of one focal length, not of a lens that
     makes them vanish. Object heights in feet are named, a sigma that is far too small is

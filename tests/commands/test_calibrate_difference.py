@@ -101,6 +101,7 @@ def test_the_difference_of_two_distortions(film, tmp_path):
     assert f"Largest difference {most:.2g}"[:-1] in said
 
 
+@pytest.mark.slow
 def test_a_picture_shows_the_difference(tmp_path):
     pytest.importorskip("matplotlib")
     told = compare(tmp_path, two_photos(tmp_path, 0.1), "--refocused")

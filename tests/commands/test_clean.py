@@ -94,6 +94,7 @@ def test_every_row_is_kept_with_its_verdict(cleaned, sample):
     assert abs(float(written[6]["q_mm"]) + 1.1) < 0.03
 
 
+@pytest.mark.slow
 def test_the_log_is_that_of_python_to_the_last_digit(cleaned, sample):
     _, out = cleaned
     (measured,) = tables.read(sample).pairs

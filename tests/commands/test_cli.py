@@ -152,6 +152,7 @@ def test_what_could_hide_is_told_and_written(tmp_path):
     assert "tau, limit 2.45" in without and "Mind: Point p4" in without
 
 
+@pytest.mark.slow
 def test_every_pair_has_a_row_and_failed_ones_their_advice(sample, tmp_path):
     lines = pair_example.TABLE.split()[1:]
     behind = [*lines, "g,1.599,-5.274,40.965,-4.319"]

@@ -54,6 +54,7 @@ def test_a_pose_graph_of_a_strip(tmp_path):
     assert all(len(line) == 3 + 7 + 21 for line in edges)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_made_is_refused_before_anything_is_written(tmp_path):
     table = tmp_path / "pairs.csv"
     table.write_text(

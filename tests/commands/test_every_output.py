@@ -130,19 +130,18 @@ def run(command, words, output, out):
     return command_line.run(command, *words, *more)
 
 
-SLOW = ("page", "pictures", "all")
-"""Outputs that take seconds each."""
+QUICK = ("orient", "pairs.csv", "all"), ("clean", "bundle.out", "json")
+"""One way through each command; every further one is a program or two, or pictures."""
 
 
 def cases(command, *without):
-    """Inputs with outputs; of the slow ones only all of a table together are in the
-    quick tests."""
+    """Inputs with outputs."""
     for kind in INPUTS:
         for output in OUTPUTS:
             if output in without:
                 continue
-            slow = output in SLOW and (kind, output) != ("pairs.csv", "all")
-            marks = [pytest.mark.slow] if slow else []
+            quick = (command, kind, output) in QUICK
+            marks = [] if quick else [pytest.mark.slow]
             yield pytest.param(command, kind, output, marks=marks)
 
 

@@ -148,6 +148,7 @@ def test_without_traverses_heights_are_read_from_known_points_or_the_grid(
     )
 
 
+@pytest.mark.slow
 def test_a_traverse_may_hang_on_corners_of_the_grid(tables, tmp_path):
     legs = [
         "traverse,from,to,back,fore",
@@ -364,6 +365,7 @@ def test_heights_from_another_zero(tables, tmp_path, example):
     )
 
 
+@pytest.mark.slow
 def test_a_plan_is_told_and_answers_backwards():
     told = words(
         run("plan", "--camera-height", 3500, "--base", 815, "--want", 1.54).stdout
@@ -385,6 +387,7 @@ def test_a_plan_is_told_and_answers_backwards():
     )
 
 
+@pytest.mark.slow
 def test_what_no_limit_was_found_for_is_not_told_as_one():
     plan = (
         "plan",

@@ -97,6 +97,7 @@ def test_the_exit_code_where_standard_output_is_refused(
     assert ("files of --out are written" in capfd.readouterr().err) == bool(code)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stream", "code"),
     [
@@ -332,6 +333,7 @@ assert os.waitpid(child, 0)[1] == 0
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="only where processes fork")
 def test_a_fork_after_the_first_call_is_told(tmp_path):
     line = [sys.executable, "-c", FORKED]

@@ -179,6 +179,7 @@ def test_an_interrupt_ends_at_once_and_what_was_done_is_kept(folder):
     assert not out.exists() and unfinished.exists()
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_resumed_to_the_same_bytes(folder, measured, whole):
     out = folder / "killed"
     stopped(folder, out, 3)
@@ -254,6 +255,7 @@ def test_a_run_that_is_killed_at_its_very_end_is_resumed(folder, whole, monkeypa
     assert contents(out) == contents(whole)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_before_its_journal_is_gone_is_resumed(
     folder, whole, monkeypatch
 ):
@@ -368,6 +370,7 @@ def test_a_stopped_run_outlives_a_call_that_cannot_work(folder, whole, tmp_path)
     assert contents(tmp_path / "out") == contents(whole)
 
 
+@pytest.mark.slow
 def test_what_appears_in_the_folder_of_results_while_they_are_made_is_not_lost(
     folder, whole, tmp_path
 ):

@@ -251,6 +251,7 @@ def paper():
     return dorozhinsky1971.run()
 
 
+@pytest.mark.slow
 def test_table_1_is_that_of_the_oracle(paper):
     for column in paper.columns[1:]:
         pair = problems.table_1(column.points)
@@ -422,6 +423,7 @@ def test_one_tolerance_reproduces_all_three_described_pairs_of_1989(paper_1989):
     assert found == {"II-13": [14, 16], "III-7": [15], "II-9": [7]}
 
 
+@pytest.mark.slow
 def test_the_six_conclusions_of_1989(paper_1989):
     """Two hold, two hold of two errors in a zone only, one is refuted, and Grubbs' test
     spoils clean pairs."""

@@ -157,6 +157,7 @@ def test_reliability_of_dense_matrices(covariances):
     close(np.stack(found.effect), moved.reshape(5, POINTS, 4)[:, :, 0])
 
 
+@pytest.mark.slow
 def test_height_changes_as_a_new_adjustment_says(pair):
     """The effect on the height of a point, through the elements and through the
     corrections, of a small error in one coordinate."""
@@ -177,6 +178,7 @@ def as_numbers(tree):
     return [np.asarray(a, float) for a in jax.tree.leaves(tree)]
 
 
+@pytest.mark.slow
 def test_one_sigma_in_matrices_is_one_sigma(pair):
     """sigma² I as a matrix of each point gives the numbers of sigma."""
     plain = eqx.tree_at(lambda p: p.roots, pair, None)

@@ -316,6 +316,7 @@ def test_a_batch_is_a_loop(system, residual):
         close(one_of(batch, i), alone, 1e-9)
 
 
+@pytest.mark.slow
 @heavy_kind
 def test_three_derivatives_agree(system, residual):
     """d elements / d measured coordinates: forward, reverse and finite differences, at
@@ -466,6 +467,7 @@ def test_failures_leave_their_neighbours_alone(system, start):
         np.testing.assert_array_equal(np.asarray(a)[1::2], np.asarray(b)[1::2])
 
 
+@pytest.mark.slow
 def test_failures_leave_their_neighbours_gradients_alone():
     good = [problems.tilted(seed=seed) for seed in range(14)]
     mixed = list(good)
@@ -491,6 +493,7 @@ def test_failures_leave_their_neighbours_gradients_alone():
     np.testing.assert_array_equal(clean[:, 1::2], spoilt[:, 1::2])
 
 
+@pytest.mark.slow
 def test_cofactors_do_not_depend_on_which_way_the_base_was_found():
     """The right photo on the left: from the vertical the base is found the wrong way
     round, and turned."""
@@ -513,6 +516,7 @@ def test_cofactors_do_not_depend_on_which_way_the_base_was_found():
     )
 
 
+@pytest.mark.slow
 def test_a_known_start_does_not_change_what_is_given():
     """Elements, their deviations and the model have one scale: that of the base given,
     or of the start."""
@@ -537,6 +541,7 @@ def test_a_known_start_does_not_change_what_is_given():
         np.testing.assert_allclose(found.model[2], scale * free.model[2], rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", [IndependentElements, DependentElements])
 def test_a_pose_has_its_cofactors_whatever_elements_were_iterated(system):
     """They are those of its own local parameters, not of the start's."""
@@ -548,6 +553,7 @@ def test_a_pose_has_its_cofactors_whatever_elements_were_iterated(system):
     np.testing.assert_allclose(found.cofactor, plain.cofactor, rtol=1e-6, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_vertical_start_is_enough_for_vertical_photos():
     """Independent elements start from zero and end where the general start ends."""
     measured = problems.tilted()

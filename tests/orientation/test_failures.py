@@ -329,6 +329,7 @@ def check_plane(wrong, certain, two):
     assert np.sum(wrong & certain) <= 3 and np.mean(two) > 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", AMBIGUOUS, ids=str)
 def test_points_of_two_orientations_do_not_say_which_is_right(kind):
     """Points in a plane, or on a critical surface."""

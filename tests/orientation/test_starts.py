@@ -368,6 +368,7 @@ def test_six_points_are_right_to_first_order(shape):
         assert errors[2] / errors[1] == pytest.approx(0.25, abs=0.06)
 
 
+@pytest.mark.slow
 def test_the_start_from_six_points_is_right_to_first_order():
     """On the 1971 geometry, padding and errors of ten minutes' size included; the
     adjustment ends where others end."""

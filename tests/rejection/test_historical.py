@@ -13,6 +13,7 @@ import numpy as np
 import oracles
 import problems
 import pytest
+from tiers import seldom
 
 import jaxro
 from jaxro import IndependentElements, pair, rejection
@@ -53,14 +54,6 @@ JUDGES = {
 HISTORICAL = {
     name: PROCEDURES.get(name, LeaveOneOutGrubbs(exact=False)) for name in JUDGES
 }
-
-
-def seldom(names, often):
-    """The names as parameters, marked slow but for those of `often`."""
-    return [
-        name if name in often else pytest.param(name, marks=pytest.mark.slow)
-        for name in names
-    ]
 
 
 def decision(found):
@@ -125,9 +118,7 @@ def random_pairs(count, *layouts):
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "name", seldom(JUDGES, ("worst-point", "dorozhinsky", "grubbs"))
-)
+@pytest.mark.parametrize("name", seldom(JUDGES, ["worst-point"]))
 def test_decisions_and_their_order_are_those_of_numpy(name, count):
     # among n points |q| is at most m_q sqrt(n - 5), less a tenth or two: 3 m_q rejects
     # nothing of 16 points

@@ -208,6 +208,7 @@ def test_no_choice_of_omissions_is_told():
     assert "Six points are left" not in OUTCOMES[OUTCOMES.no_choice]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "procedure",
     [

@@ -8,6 +8,7 @@ import examples
 import numpy as np
 import pytest
 from command_line import run, words
+from tiers import seldom
 
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
@@ -67,7 +68,7 @@ def shown(page: str) -> str:
     return words(html.unescape(re.sub(r"<[^>]+>", " ", page)))
 
 
-@pytest.mark.parametrize("name", examples.ARGUMENTS)
+@pytest.mark.parametrize("name", seldom(examples.ARGUMENTS, ["block"]))
 def test_page_is_whole_and_says_what_the_terminal_says(example, name):
     assert example(name).exit_code == 0
     told, page = example(name).stdout, example(name).report.read_text(encoding="utf-8")
@@ -86,6 +87,7 @@ def test_page_is_whole_and_says_what_the_terminal_says(example, name):
     assert "How to repeat this" in text and "jaxro" in text
 
 
+@pytest.mark.slow
 def test_names_are_no_markup(many):
     page = many[0].read_text(encoding="utf-8")
     assert "<b onclick" not in page
@@ -105,6 +107,7 @@ def test_report_of_many_pairs_details_the_worst(many):
     assert "jaxro clean finds" in words(told)
 
 
+@pytest.mark.slow
 def test_report_of_10000_pairs_is_bounded(tmp_path):
     """Its size, and the rows that a browser has to lay out."""
     random = np.random.default_rng(0)

@@ -303,6 +303,7 @@ def test_an_error_of_the_camera_height_is_in_heights_not_in_differences(paper):
     np.testing.assert_allclose(h_wrong - h, 1.76 - 1.48, atol=0.05)
 
 
+@pytest.mark.slow
 def test_a_plan_tells_what_the_paper_expects_and_what_a_survey_has():
     """Its case H = 3500, B max; and a mock survey of one traverse between two known
     points."""
@@ -356,6 +357,7 @@ def test_a_plan_tells_what_the_paper_expects_and_what_a_survey_has():
     )
 
 
+@pytest.mark.slow
 def test_a_plan_answers_the_inverse_question():
     plan, sd = planning.Plan(75.0, 3500.0, 500.0), planning.Deviations()
     of = lambda expected: expected.difference
