@@ -281,6 +281,7 @@ def hold(found, truth):
     return np.mean(squared <= np.asarray(found.radius()) ** 2)
 
 
+@pytest.mark.slow
 def test_a_table_tells_the_deviations_of_its_pairs():
     """Of errors that agree by .5 over a tenth of the photo, regions hold what they
     promise by what the table tells of them, and independent ones are left as they are;

@@ -196,6 +196,7 @@ def test_images_that_do_not_determine_their_stations_are_named():
 MILLIMETRES = 5.43764 / 1704  # of a pixel
 
 
+@pytest.mark.slow
 def test_a_published_camera(data):
     """Brown with one affinity, as published: focal length and principal place within a
     standard deviation, stations within half of one (root mean square)."""

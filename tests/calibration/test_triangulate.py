@@ -69,6 +69,7 @@ def test_points_are_those_of_an_adjustment_of_everything():
     assert np.all(new.freedom == 2 * (2 * N - 9))
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_named():
     _, points, places = survey(2, 3)
     found = calibrated(points, places)

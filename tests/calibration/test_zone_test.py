@@ -32,6 +32,7 @@ def measured(seed, step=0.0, zones=four_rectangles):
     return simulated_image.measured(seed, distort=longer)
 
 
+@pytest.mark.slow
 def test_the_statistic_is_that_of_an_independent_solution():
     pose, points, places = measured(3, step=0.05, zones=three_strips)
     zone = three_strips(places)

@@ -147,6 +147,7 @@ def test_oriented_pairs_have_the_same_figures(folder):
     assert (parts > 3) == (folder.name.startswith("many"))
 
 
+@pytest.mark.slow
 def test_cleaned_pairs_have_the_same_figures(folder):
     """Every row stays, with its verdict."""
     assert len(set(run("clean", folder, "--procedure", "three-sigma"))) == 1

@@ -233,6 +233,7 @@ def check(found, least):
     return inside, z, own, plain, mean
 
 
+@pytest.mark.slow
 def test_sums_of_squares_of_some_graphs(tmp_path):
     check(optimised(tmp_path, range(12)), 0.7)
 

@@ -63,6 +63,7 @@ def test_copies_are_those_of_comparing_each_with_each():
     assert np.array_equal(flat - begins, found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart", [0.0, 1e-9])
 def test_five_points_prove_nothing_however_often_they_stand_there(apart):
     """The orientation is that of the five, without redundancy; after cleaning it is

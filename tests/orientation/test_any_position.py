@@ -146,6 +146,7 @@ def test_most_pairs_with_errors_are_oriented(found):
     assert np.mean(sure(found["hundred"])) > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("other", "expected"),
     [

@@ -58,7 +58,7 @@ VERTICAL = jaxro.starts.Vertical()
     ("points", "start"),
     [
         (5, VERTICAL),
-        (37, VERTICAL),
+        pytest.param(37, VERTICAL, marks=pytest.mark.slow),
         *(
             pytest.param(n, jaxro.starts.Auto(), marks=pytest.mark.slow)
             for n in (3, 9, 13, 16)

@@ -63,6 +63,7 @@ def by_differences(pair, pose, cofactor, sigma0):
     return cofactor + more * np.outer(e, e), margin
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("base", "relief", "least", "most"),
     [

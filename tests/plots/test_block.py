@@ -63,6 +63,7 @@ def test_differences_are_drawn_at_known_points_by_one_factor(made):
     np.testing.assert_allclose(lines["photos"], adjusted.centres[:, :2])
 
 
+@pytest.mark.slow
 def test_ellipses_and_heights_are_those_of_the_covariances(made):
     adjusted = made[1].adjusted
     axes = plots.draw_accuracy(adjusted)

@@ -122,6 +122,7 @@ def test_uncertainty_is_shown_among_the_measured_places_only():
     np.testing.assert_allclose(values, expected)
 
 
+@pytest.mark.slow
 def test_the_map_is_that_of_corrected_coordinates(plain):
     """Both panels; an image without distortion has the corrections of its principal
     place alone, which are none."""

@@ -16,7 +16,10 @@ SIGMA = 0.01
 
 @pytest.mark.parametrize(
     ("system", "correlated"),
-    [(jaxro.RelativePose, False), (jaxro.DependentElements, True)],
+    [
+        (jaxro.RelativePose, False),
+        pytest.param(jaxro.DependentElements, True, marks=pytest.mark.slow),
+    ],
     ids=["relative", "dependent-correlated"],
 )
 def test_covariances_of_the_model_follow_from_all_coordinates(system, correlated):

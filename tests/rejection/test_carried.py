@@ -37,6 +37,7 @@ def cleaned(found: scenes.Scenes):
     )
 
 
+@pytest.mark.slow
 def test_photos_that_only_turn_have_no_base_whatever_wrong_points_say():
     """Of 24 pairs with three in ten points wrong none is successful. Where the rotation
     is told, it is that of all right points."""

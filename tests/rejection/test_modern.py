@@ -226,6 +226,7 @@ def test_of_five_points_none_is_tested(procedure):
     assert not np.any(found.statistic)
 
 
+@pytest.mark.slow
 def test_a_pose_that_no_weight_holds_is_not_at_rest():
     """Every weight zero: the pose cannot move."""
     measured, _ = contaminated(3)

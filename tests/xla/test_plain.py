@@ -88,15 +88,10 @@ def test_one_loop_of_points(pairs, monkeypatch):
     check(lambda: jaxro.orient_batch(pairs))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [
-        "recommended",
-        *(
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in ("data-snooping", "two-stage", "danish")
-        ),
-    ],
+    ["recommended", "data-snooping", "two-stage", "danish"],
 )
 def test_clean_batch(pairs, name):
     check(lambda: jaxro.clean_batch(pairs, PROCEDURES[name]))
