@@ -20,6 +20,7 @@ from . import (
     orientation as orientation,
     plots as plots,
     rejection as rejection,
+    statistics as statistics,
     surveys as surveys,
 )
 from .adjustment import (
@@ -32,8 +33,6 @@ from .adjustment import (
 )
 from .assessment import (
     budget as budget,
-    correlations as correlations,
-    familywise as familywise,
     identification as identification,
     layout_design as layout_design,
     likelihood as likelihood,

@@ -1,14 +1,14 @@
 """Assessment of an oriented pair: how much its results can be trusted.
 
 Everything is computed from the conditions linearised at the solution
-(`geometry.linear.linearise`).
+(`geometry.linear.linearise`); tests that are those of any adjustment stand in
+`statistics`.
 
     reliability            tests of single points, detectable errors and their effects
       internal_            redundancy numbers, w, sizes of detectable errors
       external_            effects of errors on elements, heights and m_q
     correlations           which points the tests can tell apart
-      familywise           critical values of the largest |w| or |tau| of a pair
-      undecided            points that explain a misfit equally well
+      undecided            points that could change places with rejected ones
       identification       errors that are attributed to the right point
     neighbours             test of correlation between the errors of neighbouring points
       correlated           accuracy of the elements under such correlation

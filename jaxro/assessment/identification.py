@@ -1,49 +1,24 @@
-"""Identification: how large an error must be to be attributed to its own point.
-
-An error that moves w_i by delta moves the w of the other points by rho_ij delta. Point
-i is *identified* by a test if it is the only point that is named (see `undecided`):
-|w_i| exceeds the limit, no other |w| is larger, and no other point explains the misfit
-as well. With x = w_i and v_j normal, independent of x, w_j = rho x + sqrt(1 - rho²)
-v_j, so that for a positive error all of this is
-
-    x > limit,    x > sqrt((1 + rho) / (1 - rho)) v_j,    x > -sqrt((1 - rho) / (1 + rho)) v_j,
-    x > (k + rho v_j) / sqrt(1 - rho²),
-
-k the normal value of `doubt`. With X the largest right-hand side, P(i is identified) is
-the mean of Φ(delta - X) over the v. The *minimal identifiable error* is the delta for
-which this mean is the wanted power, as the minimal detectable error (Baarda 1968) is
-the delta for which P(|w_i| > limit) is. With doubt = 1 it is the minimal identifiable
-bias of the largest |w| (Teunissen 2018; Rofatto et al. 2020). It is infinite where
-|rho| = 1.
+"""Identification of wrong points: how large an error of a coordinate must be to be found,
+and to be attributed to its own point (`statistics.identification`).
 
 Everything is of first order, at the measured coordinates, with a known sigma0.
-Probabilities that depend on several residuals are simulated from a key, with the same
-draws for all points.
 """
 
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jax import lax
-from jax.scipy.special import ndtr
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, ScalarLike
 
 from ..adjustment import critical_values as critical
-from ..adjustment.bisection import bisect
 from ..geometry.linear import Linear, Values, linearise
 from ..geometry.pairs import Coordinates, Pair, mask_unusable
 from ..orientation.orient import Orientation
-from .correlations import Normalised, normalise
-from .familywise import largest_w
-from .undecided import DOUBT, explanations
-
-HALVINGS = 50
-"""Of the interval in which the size of an error is sought."""
-
-SAME = 1e-6
-"""1 - |rho| below which nothing tells two points apart."""
+from ..statistics import identification
+from ..statistics.explanations import DOUBT
+from ..statistics.identification import Chances
+from ..statistics.normalised import Normalised
+from .correlations import normalise
 
 
 class Identification(eqx.Module):
@@ -68,19 +43,6 @@ class Identification(eqx.Module):
     identified: Values
     detectable: Coordinates
     identifiable: Coordinates
-
-
-class Chances(eqx.Module):
-    """Probabilities of what becomes of an error in each point: one point is named, the
-    right one (`correct`) or another one (`wrong`); several points are named, the right
-    one among them (`undecided`) or not (`misled`); or none is named (`missed`). They
-    add up to 1; zero where a point is not tested."""
-
-    correct: Values
-    wrong: Values
-    undecided: Values
-    misled: Values
-    missed: Values
 
 
 def correlations(pair: Pair, orientation: Orientation) -> Float[Array, "point point"]:
@@ -112,27 +74,18 @@ def identify(
     static.
     """
     pair, linear, known = _read(pair, orientation)
-    limit = _limit(known, level, familywise)
-    found = jnp.asarray(critical.delta_normal(2 * ndtr(-limit), power))
-    errors = _draw_errors(known, key, draws)
-    correlation, partner = _partners(known)
-
-    def size(point: Int[Array, ""]) -> Float[Array, ""]:
-        least, able = _least(known, errors, point, limit, doubt)
-        return _size(least, jnp.asarray(power, float), able)
-
-    sizes = lax.map(size, jnp.arange(known.w.shape[0]))
-    identified = jnp.where(known.tested, sizes, jnp.inf)
+    how = {"level": level, "power": power, "familywise": familywise, "doubt": doubt}
+    sizes = identification.identify(known, key, draws=draws, **how)
     per_coordinate = lambda delta: _of_coordinates(pair, linear, known, delta, sigma0)
     return Identification(
-        tested=known.tested,
-        partner=partner,
-        correlation=correlation,
-        limit=limit,
-        found=found,
-        identified=jnp.where(pair.mask, identified, 0.0),
-        detectable=per_coordinate(jnp.ones_like(known.w) * found),
-        identifiable=per_coordinate(jnp.where(known.tested, sizes, 1.0)),
+        tested=sizes.tested,
+        partner=sizes.partner,
+        correlation=sizes.correlation,
+        limit=sizes.limit,
+        found=sizes.found,
+        identified=jnp.where(pair.mask, sizes.identified, 0.0),
+        detectable=per_coordinate(jnp.ones_like(known.w) * sizes.found),
+        identifiable=per_coordinate(jnp.where(known.tested, sizes.identified, 1.0)),
     )
 
 
@@ -156,46 +109,11 @@ def chances(
     to 3: x_left, y_left, x_right, y_right). Other arguments as of `identify`.
     """
     _, linear, known = _read(pair, orientation)
-    limit = _limit(known, level, familywise)
     size = jnp.broadcast_to(jnp.asarray(size, float), known.w.shape)
     root = jnp.sqrt(linear.weight * known.redundancy)
     delta = linear.gradient[coordinate] * size * root / jnp.asarray(sigma0)
-    errors = _draw_errors(known, key, draws)
-
-    def with_error(point: Int[Array, ""]) -> tuple[Float[Array, ""], ...]:
-        own = jnp.arange(known.w.shape[0]) == point
-        shift = known.row(point) * jnp.sum(jnp.where(own, delta, 0.0))
-        outcomes = jax.vmap(lambda w: _judge(known, w + shift, own, limit, doubt))
-        tested = jnp.any(own & known.tested)
-        share = lambda happened: jnp.mean(happened.astype(float))
-        return jax.tree.map(
-            lambda happened: jnp.where(tested, share(happened), 0.0), outcomes(errors)
-        )
-
-    correct, wrong, undecided, misled, missed = lax.map(
-        with_error, jnp.arange(known.w.shape[0])
-    )
-    return Chances(
-        correct=correct, wrong=wrong, undecided=undecided, misled=misled, missed=missed
-    )
-
-
-def _judge(
-    known: Normalised,
-    w: Values,
-    own: Bool[Array, "point"],
-    limit: Array,
-    doubt: ScalarLike,
-) -> tuple[Bool[Array, ""], ...]:
-    """Which of the fields of `Chances` happens with these w, if the error is in the
-    `own` point: exactly one is True."""
-    size = jnp.abs(w)
-    named = explanations(known._replace(w=w), jnp.argmax(size), doubt)
-    found = jnp.max(size) > limit
-    alone, among = jnp.sum(named) == 1, jnp.any(named & own)
-    correct, wrong = found & among & alone, found & ~among & alone
-    several, misled = found & among & ~alone, found & ~among & ~alone
-    return correct, wrong, several, misled, ~found
+    how = {"level": level, "familywise": familywise, "doubt": doubt}
+    return identification.chances(known, key, delta, draws=draws, **how)
 
 
 class _Read(NamedTuple):
@@ -217,23 +135,6 @@ def _read(pair: Pair, orientation: Orientation) -> _Read:
     return _Read(pair, linear, normalise(linear, pair.mask & orientation.usable))
 
 
-def _limit(known: Normalised, level: ScalarLike, familywise: bool) -> Float[Array, ""]:
-    if familywise:
-        return largest_w(level, known)
-    return critical.normal(level) + 0 * known.squares
-
-
-def _draw_errors(
-    known: Normalised, key: PRNGKeyArray, draws: int
-) -> Float[Array, "draw point"]:
-    """The w of errorless pairs."""
-    root = jnp.sqrt(jnp.where(known.tested, known.redundancy, 1.0))
-    noise = jax.random.normal(key, (draws, known.w.shape[0]), float)
-    along = noise @ (known.basis * root[:, None])
-    w = noise / root[None, :] - along @ known.basis.T
-    return jnp.where(known.tested[None, :], w, 0.0)
-
-
 def _of_coordinates(
     pair: Pair, linear: Linear, known: Normalised, delta: Values, sigma0: ArrayLike
 ) -> Coordinates:
@@ -248,49 +149,3 @@ def _of_coordinates(
         return jnp.where(pair.mask, jnp.where(seen, error, jnp.inf), 0.0)
 
     return tuple(size(b) for b in linear.gradient)
-
-
-def _partners(known: Normalised) -> tuple[Values, Int[Array, "point"]]:
-    """The correlation largest in size of each point with another, and that other
-    point."""
-    points = jnp.arange(known.w.shape[0])
-
-    def partner(point: Int[Array, ""]):
-        rho = jnp.where(points == point, 0.0, known.row(point))
-        other = jnp.argmax(jnp.abs(rho))
-        return rho[other], other
-
-    return lax.map(partner, points)
-
-
-def _least(
-    known: Normalised,
-    errors: Float[Array, "draw point"],
-    point: Int[Array, ""],
-    limit: Array,
-    doubt: ScalarLike,
-) -> tuple[Float[Array, "draw"], Bool[Array, ""]]:
-    """X of every draw, and whether any size of error can be told from one in another
-    point."""
-    own = jnp.arange(known.w.shape[0]) == point
-    others = known.tested & ~own
-    rho = jnp.where(others, known.row(point), 0.0)[None, :]
-    across = jnp.sqrt(jnp.maximum(1 - rho**2, SAME))
-    w_own = jnp.sum(jnp.where(own[None, :], errors, 0.0), axis=1)
-    v = (errors - rho * w_own[:, None]) / across
-    larger = jnp.sqrt((1 + rho) / jnp.maximum(1 - rho, SAME)) * v
-    smaller = -jnp.sqrt((1 - rho) / jnp.maximum(1 + rho, SAME)) * v
-    in_doubt = (critical.normal(doubt) + rho * v) / across
-    needed = jnp.maximum(jnp.maximum(larger, smaller), in_doubt)
-    needed = jnp.max(jnp.where(others[None, :], needed, -jnp.inf), axis=1)
-    return jnp.maximum(needed, limit), jnp.all(jnp.abs(rho) < 1 - SAME)
-
-
-def _size(
-    least: Float[Array, "draw"], power: Array, able: Bool[Array, ""]
-) -> Float[Array, ""]:
-    """delta with mean Φ(delta - X) = power; infinite where it is not able."""
-    enough = lambda delta: jnp.mean(ndtr(delta - least)) >= power
-    most = jnp.max(least) + 9
-    delta = bisect(enough, most * 0, most, HALVINGS)
-    return jnp.where(able, delta, jnp.inf)

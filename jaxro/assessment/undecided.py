@@ -1,78 +1,22 @@
-"""Points that explain a misfit as well as the one with the largest |w| does: one of
-them is wrong, but nothing tells which.
-
-Let i have the largest |w|. If the error is in j instead, the adjustment without j has
-no error, and the w of i in it,
-
-    w_i|j = (w_i - rho_ij w_j) / sqrt(1 - rho_ij²),
-
-is normal with standard deviation 1 whatever the size of the error. So j is named
-together with i unless |w_i|j| exceeds the two-sided normal value of `doubt`. A wrong
-point j is then passed over in favour of one given other point with the probability
-`doubt`. If sigma0 is estimated, from the residuals without j, the value is that of the
-tau distribution with one degree of freedom less.
-
-This is a likelihood ratio: Σ r² grows by w_i|j² when i is put back into the adjustment
-without both. Points with |rho_ij| = 1 are always named together. Only i is named where
-the others are little correlated with it, or where its error is large.
-"""
+"""Points that a procedure has rejected, and that could change places with one in use:
+some of them are wrong, but nothing tells which (`statistics.explanations`)."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int, ScalarLike
+from jaxtyping import Array, Bool, Float, ScalarLike
 
 from ..adjustment import critical_values
 from ..adjustment.critical_values import UNTESTABLE
-from ..adjustment.guarded import ratio
 from ..geometry.elements import RelativePose
 from ..geometry.linear import Linear, Values, linearise
 from ..geometry.pairs import Pair
+from ..statistics.explanations import DOUBT
 from ..xla.kernels import while_loop
 from ..xla.passes import count
-from .correlations import Normalised, normalise, orthonormal_columns
+from .correlations import normalise, orthonormal_columns
 
 Use = Bool[Array, "point"]
-
-DOUBT = 0.01
-"""Probability with which a wrong point is passed over for another one that is named
-alone."""
-
-ROUNDING = 1e-6
-"""Part of |w| by which two residuals that are the same may differ."""
-
-
-def explanations(
-    normalised: Normalised,
-    point: Int[Array, ""],
-    doubt: ScalarLike = DOUBT,
-    estimated: bool = False,
-) -> Use:
-    """The points whose omission explains the misfit as well as the omission of `point`
-    does; `point` is one of them. `estimated`: sigma0 is not known."""
-    rho, w = normalised.row(point), normalised.w
-    own = jnp.arange(w.shape[0]) == point
-    w_own = jnp.sum(jnp.where(own, w, 0.0))
-    limit = jnp.asarray(critical_values.normal(doubt))
-    if estimated:
-        limit = _limit_of_tau(normalised, doubt)
-    spread = jnp.sqrt(jnp.maximum(1 - rho**2, UNTESTABLE**2))
-    room = ROUNDING * jnp.abs(w_own)
-    near = jnp.abs(w_own - rho * w) <= limit * spread + room
-    return normalised.tested & (near | own)
-
-
-def _limit_of_tau(normalised: Normalised, doubt: ScalarLike) -> Values:
-    """The limit of |w_i|j| for every j, by sigma0 of the residuals without j; infinite
-    with one degree of freedom left, where there is no test and all points are named."""
-    w, freedom = normalised.w, normalised.freedom - 1
-    points = freedom + 6
-    value = lambda n: critical_values.tau(doubt, np.maximum(n - 6, 1.0))
-    tau = critical_values.by_count(value, w.shape[0], points)
-    rest = jnp.maximum(normalised.squares - w**2, 0.0)
-    sigma0 = jnp.sqrt(rest / jnp.maximum(freedom, 1.0))
-    return jnp.where(freedom > 1, jnp.where(freedom > 1, tau, 1.0) * sigma0, jnp.inf)
 
 
 def undecided_points(
@@ -162,20 +106,3 @@ def _compare(linear: Linear, use: Use) -> _Exchange:
         w=jnp.where(use, known.w, rejected_w),
         use=use,
     )
-
-
-def misfit(
-    normalised: Normalised,
-    limit: Float[Array, ""],
-    doubt: ScalarLike = DOUBT,
-    estimated: bool = False,
-) -> tuple[Values, Use]:
-    """|w| of the points (|tau| if sigma0 is `estimated`), and the points of which one
-    is wrong: the explanations of the largest value if it exceeds the limit, else
-    none."""
-    unit = jnp.ones_like(normalised.squares)
-    if estimated:
-        unit = jnp.sqrt(normalised.squares / jnp.maximum(normalised.freedom, 1.0))
-    w = ratio(jnp.abs(normalised.w), unit, unit > 0)
-    found = jnp.max(w) > limit
-    return w, explanations(normalised, jnp.argmax(w), doubt, estimated) & found

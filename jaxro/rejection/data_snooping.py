@@ -5,14 +5,15 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, ScalarLike
 
 from ..adjustment import critical_values
-from ..assessment.correlations import Normalised, normalise
-from ..assessment.familywise import largest_tau, largest_w
-from ..assessment.undecided import DOUBT, misfit
+from ..assessment.correlations import normalise
 from ..geometry.elements import RelativePose
 from ..geometry.linear import linearise
 from ..geometry.pairs import Pair, mask_unusable
 from ..orientation.orient import orient
 from ..orientation.starts import AbstractStart, Vertical
+from ..statistics.explanations import DOUBT, misfit
+from ..statistics.familywise import largest_tau, largest_w
+from ..statistics.normalised import Normalised
 from ..xla.passes import count
 from .agreement import state_sigma
 from .base import AbstractProcedure, PointValues, Rejection
@@ -39,7 +40,7 @@ class DataSnooping(AbstractProcedure):
     If the omission of another point would explain the misfit as well, these points are
     `undecided`, none of them is rejected, and the procedure stops. `doubt`: the
     probability that a wrong point is passed over for another one (see
-    `assessment.undecided`); with 1 the largest |w| always goes.
+    `statistics.explanations`); with 1 the largest |w| always goes.
     """
 
     level: ScalarLike = 0.001

@@ -11,12 +11,13 @@ import pytest
 
 import jaxro
 from jaxro import IndependentElements
-from jaxro.assessment import correlations, familywise, identification
+from jaxro.assessment import correlations, identification
 from jaxro.assessment.undecided import undecided_points
 from jaxro.experiments.compare import Setting, simulate
 from jaxro.geometry import mock_pairs
 from jaxro.geometry.linear import linearise
 from jaxro.rejection import OUTCOMES, DataSnooping
+from jaxro.statistics import familywise
 
 SIGMA = 0.01
 SNOOPING = DataSnooping(level=0.0025, familywise=True)

@@ -1,7 +1,7 @@
-"""Critical values of the largest |w| and the largest |tau| of a pair, from their
+"""Critical values of the largest |w| and the largest |tau| of an adjustment, from their
 correlations.
 
-The level is the probability that any point of an errorless pair is rejected. The shares
+The level is the probability that any row of errorless observations is rejected. The shares
 of Bonferroni or Šidák keep it only where the w are independent: of 6, 7, 8 and 12
 points in the standard zones a nominal 5 % are in truth 0.9, 1.8, 2.5 and 4.3 %, as six
 points have but one w among them.
@@ -13,15 +13,15 @@ Then
 
 (Naiman and Wynn 1997). m is the effective number of tests: 1 if all events are the
 same, n if no two happen together. The expectation is a mean over `DRAWS` fixed draws,
-each for one point i in turn: w_i is drawn beyond c, and the other w given w_i. As 1/N
+each for one row i in turn: w_i is drawn beyond c, and the other w given w_i. As 1/N
 lies between 1/n and 1, the mean has a small variance however rare the event is. c is
 the critical value of one test at the level over m, with m found at the value of n tests
 first and then once more.
 
 In layouts of 6 to 50 points the true probability is within 0.15 % of a nominal 5 % and
-within 0.02 % of a nominal 0.25 %. Pairs of more than `MOST` points have the value of
+within 0.02 % of a nominal 0.25 %. Adjustments of more than `MOST` rows have the value of
 Šidák; the difference is smaller than that, unless most points lie in one place. The
-draws belong to the tested points in their order, so that masked points change nothing.
+draws belong to the tested rows in their order, so that masked rows change nothing.
 """
 
 from collections.abc import Callable
@@ -32,13 +32,13 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..adjustment import critical_values as critical
 from ..xla.kernels import computed_once, while_loop
-from .correlations import Normalised
+from .normalised import Normalised
 
 DRAWS = 1024
 """Fixed draws: the effective number is right to about 1 %."""
 
 MOST = 64
-"""Tested points up to which the effective number is found."""
+"""Tested rows up to which the effective number is found."""
 
 TURNS = 2
 """Evaluations of the effective number. It depends little on the critical value at which
@@ -50,7 +50,7 @@ equal ratios."""
 
 
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Normal numbers (point, draw), and evenly spread numbers (draw) of the density
+    """Normal numbers (row, draw), and evenly spread numbers (draw) of the density
     exp(-x)."""
     random = np.random.default_rng(1968)
     normal = random.normal(size=(MOST, DRAWS))
@@ -62,7 +62,7 @@ NORMAL, EXPONENTIAL = _tables()
 
 
 def largest_w(level: ArrayLike, normalised: Normalised) -> Float[Array, ""]:
-    """The value that the largest |w| of an errorless pair exceeds with probability
+    """The value that the largest |w| of errorless observations exceeds with probability
     `level`; sigma0 is known."""
     value = lambda number: critical.normal(level / number)
     beyond = critical.by_count(
@@ -74,19 +74,20 @@ def largest_w(level: ArrayLike, normalised: Normalised) -> Float[Array, ""]:
 
 
 def largest_tau(level: ArrayLike, normalised: Normalised) -> Float[Array, ""]:
-    """The value that the largest |tau| of an errorless pair exceeds with probability
+    """The value that the largest |tau| of errorless observations exceeds with probability
     `level`; sigma0 is estimated. Infinite with one degree of freedom, where every |tau|
     is 1."""
-    most, points = normalised.w.shape[0], normalised.freedom + 5
-    freedom = lambda n: np.maximum(n - 5, 1.0)
+    p, most = normalised.parameters, normalised.w.shape[0]
+    rows = normalised.freedom + p
+    freedom = lambda n: np.maximum(n - p, 1.0)
     beyond = critical.by_count(
-        lambda n: critical.tau(critical.sidak(level, n), freedom(n)), most, points
+        lambda n: critical.tau(critical.sidak(level, n), freedom(n)), most, rows
     )
     number = MOST ** (np.arange(KNOTS) / (KNOTS - 1))
     n = np.arange(min(most, MOST) + 1.0)
     table = critical.tau(level / number[None, :], freedom(n)[:, None])
-    own = jnp.arange(n.size) == points.astype(int)
-    own = own & (n > 6)
+    own = jnp.arange(n.size) == rows.astype(int)
+    own = own & (n > p + 1)
     row = jnp.sum(jnp.where(own[:, None], table, 0.0), axis=0)
     value = lambda number: _cubic(row, jnp.log(number) / np.log(MOST) * (KNOTS - 1))
     found = _largest(value, beyond, normalised, _draw_tau)
@@ -96,9 +97,8 @@ def largest_tau(level: ArrayLike, normalised: Normalised) -> Float[Array, ""]:
 def effective_number(
     normalised: Normalised, limit: ArrayLike, estimated: bool = False
 ) -> Float[Array, ""]:
-    """The number of independent tests that reject as often as the tests of the points
-    of a pair, each at |w| = limit (|tau| if sigma0 is `estimated`); for at most MOST
-    points."""
+    """The number of independent tests that reject as often as the tests of the rows,
+    each at |w| = limit (|tau| if sigma0 is `estimated`); for at most MOST rows."""
     draw = _draw_tau if estimated else _draw_w
     return _number(_few(normalised), jnp.asarray(limit, float), draw)
 
@@ -106,8 +106,7 @@ def effective_number(
 def _largest(
     value: Callable, beyond: Array, normalised: Normalised, draw: Callable
 ) -> Float[Array, ""]:
-    """value(m) at the effective number m; `beyond` for pairs of more than MOST
-    points."""
+    """value(m) at the effective number m; `beyond` for more than MOST rows."""
 
     def find(normalised: Normalised) -> Float[Array, ""]:
         few = _few(normalised)
@@ -119,7 +118,7 @@ def _largest(
     if normalised.w.shape[0] <= MOST:
         return find(normalised)
 
-    # a loop of at most one round: under vmap it is entered only if some pair needs it
+    # a loop of at most one round: under vmap it is entered only if some of them needs it
     def once(state):
         needed, _ = state
         tested = normalised.tested & needed
@@ -131,17 +130,17 @@ def _largest(
 
 
 def _number(few: Normalised, limit: Array, draw: Callable) -> Float[Array, ""]:
-    """Σ E[1/N | A_i] by the draws: draw k is for the tested point k modulo their
+    """Σ E[1/N | A_i] by the draws: draw k is for the tested row k modulo their
     number."""
     n, places = _count(few), few.w.shape[0]
-    number, point = jnp.maximum(n, 1.0), jnp.arange(DRAWS)
-    own = point % number.astype(int)
+    number, draws = jnp.maximum(n, 1.0), jnp.arange(DRAWS)
+    own = draws % number.astype(int)
     used = jnp.where(few.tested, 1.0, 0.0)
     root = jnp.sqrt(jnp.where(few.tested, few.redundancy, 1.0))
     errors = jnp.asarray(NORMAL[:places])
     along = (few.basis * root[:, None]).T @ errors
     basis = few.basis[own].T
-    w = jnp.asarray(NORMAL.T)[point, own] / root[own] - jnp.sum(basis * along, axis=0)
+    w = jnp.asarray(NORMAL.T)[draws, own] / root[own] - jnp.sum(basis * along, axis=0)
     inside = used @ errors**2 - jnp.sum(along**2, axis=0)
     at, threshold, weight = draw(limit, w, inside, few.freedom)
 
@@ -184,11 +183,11 @@ def _draw_tau(
 
 
 def _few(normalised: Normalised) -> Normalised:
-    """The tested points one behind the other, in at most MOST places."""
-    points = normalised.w.shape[0]
-    places = min(points, MOST)
+    """The tested rows one behind the other, in at most MOST places."""
+    rows = normalised.w.shape[0]
+    places = min(rows, MOST)
     rank = jnp.cumsum(normalised.tested.astype(int)) - 1
-    rank = jnp.where(normalised.tested, rank, points)
+    rank = jnp.where(normalised.tested, rank, rows)
 
     def pack(values: Array) -> Array:
         empty = jnp.zeros((places, *values.shape[1:]), values.dtype)

@@ -1,0 +1,8 @@
+"""Tests of the rows of any solution: which observations are wrong, and which errors
+would be found.
+
+    normalised         normalised residuals w and their correlations
+    familywise         critical values of the largest |w| or |tau|
+    explanations       rows that explain a misfit equally well
+    identification     errors that are attributed to the right row
+"""
