@@ -17,7 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.ops import segment_sum
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..xla.programs import is_traced
 from . import normal_equations as normal, symmetric
@@ -26,6 +26,9 @@ from .terms import Term
 
 Matrix = Float[Array, "kept kept"]
 Vector = Float[Array, " kept"]
+
+Held = dict[str, Bool[Array, "_ _"]]
+"""Of every family the local parameters that do not move, (member, d)."""
 
 
 class Blocks(NamedTuple):
@@ -225,6 +228,21 @@ def _divided(layout: Layout, term: Term, part: Linearised) -> tuple[list, list]:
     return own, [entry for entry in touched if not layout.is_eliminated(entry[0])]
 
 
+def hold(layout: Layout, normals: Normals, held: Held) -> Normals:
+    """The normal equations of which some parameters are held: their columns are zero,
+    and each has the equation step = 0 of weight 1."""
+    n, h, sums = normals
+    of_kept = jnp.concatenate(
+        [held[block.name].reshape(-1) for block in layout.kept]
+    ).astype(n.dtype)
+    n = n + jnp.diag(of_kept)
+    if sums is not None and layout.eliminated is not None:
+        of_blocks = held[layout.eliminated.name].astype(n.dtype)
+        unit = jnp.eye(sums.v.shape[1], dtype=n.dtype)
+        sums = sums._replace(v=sums.v + of_blocks[:, :, None] * unit[None])
+    return Normals(n, h, sums)
+
+
 def damp(normals: Normals, damping: Float[Array, ""]) -> Normals:
     """The normal equations, the diagonal of which is larger by the part `damping`."""
     n, h, sums = normals
@@ -297,6 +315,21 @@ def solve(
         Carried(steps, inverse, by_kept),
         jnp.concatenate([of_blocks, pivots]),
     )
+
+
+def without_held(layout: Layout, solution: Solution, held: Held) -> Solution:
+    """The solution with the cofactors of held parameters, which are zero."""
+    dtype = solution.cofactor.dtype
+    free = jnp.concatenate([~held[block.name].reshape(-1) for block in layout.kept])
+    free = free.astype(dtype)
+    solution = solution._replace(
+        cofactor=solution.cofactor * free[:, None] * free[None, :]
+    )
+    if solution.eliminated is None or layout.eliminated is None:
+        return solution
+    of_blocks = (~held[layout.eliminated.name]).astype(dtype)
+    inverse = solution.eliminated.inverse * of_blocks[:, :, None] * of_blocks[:, None]
+    return solution._replace(eliminated=solution.eliminated._replace(inverse=inverse))
 
 
 def _kept(

@@ -20,7 +20,7 @@ from .blocks import (
     normalise,
     residuals,
 )
-from .elimination import Layout, Solution
+from .elimination import Blocks, Held, Layout, Solution
 from .guarded import root, times
 from .levenberg_marquardt import DampedStep, promised
 from .losses import AbstractLoss
@@ -76,6 +76,7 @@ class Joint(eqx.Module):
     layout: Layout
     constraints: Callable | None
     loss: AbstractLoss | None
+    held: Held | None
 
     def __call__(self, steps: Steps) -> list[Array]:
         """The whitened (and, with a loss, transformed) residuals of every term."""
@@ -90,8 +91,7 @@ class Joint(eqx.Module):
 
     def damped(self, steps: Steps, damping: Float[Array, ""]) -> DampedStep:
         """What Levenberg-Marquardt subtracts from the displacements."""
-        parts = [_weight(part, self.loss) for part in self.linearise(steps)]
-        normals = elimination.accumulate(self.layout, self.terms, parts)
+        normals = self._accumulate(self.linearise(steps), self.loss)
         found = elimination.solve(
             elimination.damp(normals, damping), self._constraint(steps)
         )
@@ -106,16 +106,41 @@ class Joint(eqx.Module):
         return jax.tree.map(jnp.add, steps, step)
 
     def linearise(self, steps: Steps) -> list[Linearised]:
-        return [linearise(term, self.families, steps) for term in self.terms]
+        return [
+            self._release(term, linearise(term, self.families, steps))
+            for term in self.terms
+        ]
+
+    def _release(self, term: Term, part: Linearised) -> Linearised:
+        """The term without the derivatives by what is held."""
+        if self.held is None:
+            return part
+        fixed = [self.held[name][member] for name, member in term.touches]
+        columns = zip(part.columns, fixed, strict=True)
+        return Linearised(
+            part.residuals, tuple(jnp.where(f[:, None], 0.0, a) for a, f in columns)
+        )
 
     def solve(
         self, steps: Steps, parts: list[Linearised], loss: AbstractLoss | None
     ) -> Solution:
         """The solution of the normal equations with the weights of a loss."""
+        normals = self._accumulate(parts, loss)
+        solution = elimination.solve(normals, self._constraint(steps))
+        if self.held is None:
+            return solution
+        return elimination.without_held(self.layout, solution, self.held)
+
+    def _accumulate(
+        self, parts: list[Linearised], loss: AbstractLoss | None
+    ) -> elimination.Normals:
+        """The normal equations with the weights of a loss."""
         normals = elimination.accumulate(
             self.layout, self.terms, [_weight(part, loss) for part in parts]
         )
-        return elimination.solve(normals, self._constraint(steps))
+        if self.held is None:
+            return normals
+        return elimination.hold(self.layout, normals, self.held)
 
     def _constraint(self, steps: Steps) -> tuple[Array, Array] | None:
         if self.constraints is None:
@@ -132,13 +157,25 @@ class Joint(eqx.Module):
         kept = jnp.concatenate(
             [steps[block.name].reshape(-1) for block in self.layout.kept]
         )
-        return jax.jacrev(of_kept)(kept), of_kept(kept)
+        slopes, value = jax.jacrev(of_kept)(kept), of_kept(kept)
+        if self.held is not None:
+            fixed = [self.held[block.name].reshape(-1) for block in self.layout.kept]
+            slopes = jnp.where(jnp.concatenate(fixed)[None], 0.0, slopes)
+        return slopes, value
 
 
 def check_families(
-    terms: tuple[Term, ...], start: Families, eliminate: str | None
+    terms: tuple[Term, ...],
+    start: Families,
+    eliminate: str | None,
+    held: dict[str, ArrayLike] | None,
 ) -> None:
     """Raises ValueError for terms and families that do not go together."""
+    if unknown := set(held or {}) - set(start):
+        raise ValueError(
+            f"adjust: {sorted(unknown)} is held, and no family; there are "
+            f"{sorted(start)}"
+        )
     for name, family in start.items():
         if any(jnp.ndim(a) == 0 for a in jax.tree.leaves(family)):
             raise ValueError(
@@ -148,12 +185,26 @@ def check_families(
     elimination.layout(start, terms, eliminate)
 
 
+def held_of(layout: Layout, held: dict[str, ArrayLike]) -> Held:
+    """For every local parameter whether it is held; of a family one flag for all, one
+    for each member, or one for each number of each member."""
+
+    def spread_flags(block: Blocks) -> Bool[Array, "_ _"]:
+        flags = jnp.asarray(held.get(block.name, False))
+        if flags.ndim == 1:
+            flags = flags[:, None]
+        return jnp.broadcast_to(flags, (block.members, block.size))
+
+    return {block.name: spread_flags(block) for block in layout.blocks}
+
+
 def adjust_jointly(
     terms: tuple[Term, ...],
     start: Families,
     *,
     eliminate: str | None = None,
     constraints: Callable | None = None,
+    held: dict[str, ArrayLike] | None = None,
     loss: AbstractLoss | None = None,
     solver: optx.AbstractLeastSquaresSolver | None = None,
     max_steps: int = 30,
@@ -170,7 +221,8 @@ def adjust_jointly(
     }
     layout = elimination.layout(families, terms, eliminate)
     terms = tuple(close_blocks(term, families) for term in terms)
-    joint = Joint(terms, families, layout, constraints, loss)
+    fixed = None if held is None else held_of(layout, held)
+    joint = Joint(terms, families, layout, constraints, loss, fixed)
     origin = {
         block.name: jnp.zeros((block.members, block.size), float)
         for block in layout.blocks
@@ -180,7 +232,7 @@ def adjust_jointly(
         name: normalise(move(families[name], step))
         for name, step in found.value.items()
     }
-    at_solution = Joint(terms, solved, layout, constraints, loss)
+    at_solution = Joint(terms, solved, layout, constraints, loss, fixed)
     return _read(
         at_solution,
         origin,
@@ -205,7 +257,10 @@ def _read(
         ]
     )
     known = 0 if joint.constraints is None else joint._constraint(steps)[1].shape[0]  # pyright: ignore[reportOptionalSubscript]
-    freedom = jnp.sum(use) - (layout.total - known)
+    unknown = layout.total - known
+    if joint.held is not None:
+        unknown = unknown - sum(jnp.sum(fixed) for fixed in joint.held.values())
+    freedom = jnp.sum(use) - unknown
     checked = freedom > 0
     solution = weighted
     if loss is None:
@@ -213,9 +268,7 @@ def _read(
             jnp.sum(rows**2) / jnp.where(checked, freedom, 1).astype(rows.dtype)
         )
     else:
-        sigma0, factor = spread(
-            loss, rows, use.astype(rows.dtype), layout.total - known
-        )
+        sigma0, factor = spread(loss, rows, use.astype(rows.dtype), unknown)
         factor = jnp.where(checked, factor, 1.0)
         plain = joint.solve(steps, parts, None)
         blocks = plain.eliminated

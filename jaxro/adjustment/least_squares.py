@@ -67,6 +67,7 @@ def adjust(
     *,
     eliminate: str | None = None,
     constraints: Callable | None = None,
+    held: dict[str, ArrayLike] | None = None,
     loss: AbstractLoss | None = None,
     solver: optx.AbstractLeastSquaresSolver | None = None,
     max_steps: int = 30,
@@ -82,6 +83,8 @@ def adjust(
     `eliminate` names the family with the most blocks, if no condition joins two of
     them; only its Schur complement is then inverted. `constraints(parameters)`: numbers
     of the kept families that are to become zero, as the datum of a free network.
+    `held`: what keeps its start, by family: one flag for all, for each member, or for
+    each local parameter of each member, (member, d).
     `solver`: any optimistix least-squares solver; `GaussNewton()` if None.
 
     With a loss, normal matrix and redundancy carry the final weights rho'(r²); sigma0
@@ -94,13 +97,15 @@ def adjust(
     terms = (terms,) if isinstance(terms, Term) else tuple(terms)
     how = {"loss": loss, "solver": solver, "max_steps": max_steps}
     if terms and all(term.touches for term in terms):
-        check_families(terms, start, eliminate)
-        how |= {"eliminate": eliminate, "constraints": constraints}
+        check_families(terms, start, eliminate, held)
+        if held is not None:
+            held = {name: np.asarray(flags) for name, flags in held.items()}
+        how |= {"eliminate": eliminate, "constraints": constraints, "held": held}
         return _as_program(adjust_jointly)(terms, start, **how)
-    if len(terms) != 1 or eliminate is not None or constraints is not None:
+    if len(terms) != 1 or not (eliminate is constraints is held is None):
         raise ValueError(
-            "adjust: several terms, `eliminate` and `constraints` are for parameters "
-            "in blocks; name the blocks of every term in its `touches`"
+            "adjust: several terms, `eliminate`, `constraints` and `held` are for "
+            "parameters in blocks; name the blocks of every term in its `touches`"
         )
     return _as_program(_adjust_alone)(terms[0], start, **how)
 

@@ -93,6 +93,52 @@ def test_three_hundred_heights_from_two_threads(net):
         assert found.degrees_of_freedom == len(w) - NODES
 
 
+@pytest.mark.parametrize("eliminate", [None, "far"])
+@pytest.mark.parametrize("solver", [None, jaxro.adjustment.LevenbergMarquardt()])
+def test_what_is_held_is_known(eliminate, solver):
+    """Points of a plane by distances from two stations, one of which has a known
+    coordinate; the last point is known: as if their columns were not there."""
+    rng = np.random.default_rng(3)
+    near = np.array([[0.0, 0], [9, 1], [4, -7]])
+    far = rng.uniform(-4, 12, (4, 2))
+    station, point = (grid.ravel() for grid in np.indices((3, 4)))
+    apart = np.linalg.norm(near[station] - far[point], axis=1)
+    term = Term(
+        lambda a, b, length: jnp.sqrt(jnp.sum((a - b) ** 2)) - length,
+        apart + 0.01 * rng.normal(size=apart.shape),
+        1e-4,
+        touches=[("near", station), ("far", point)],
+    )
+    held = {
+        "near": np.array([[True, True], [False, True], [False, False]]),
+        "far": np.arange(4) == 3,
+    }
+    start = {"near": near, "far": far}
+    found = adjust(term, start, held=held, eliminate=eliminate, solver=solver)
+    moved = {name: np.asarray(found.parameters[name]) for name in start}
+    np.testing.assert_array_equal(moved["near"][held["near"]], near[held["near"]])
+    np.testing.assert_array_equal(moved["far"][3], far[3])
+
+    away = moved["near"][station] - moved["far"][point]
+    slope = away / np.linalg.norm(away, axis=1)[:, None] / 0.01
+    design = np.zeros((len(apart), 14))
+    for k in range(2):
+        design[np.arange(len(apart)), 2 * station + k] = slope[:, k]
+        design[np.arange(len(apart)), 6 + 2 * point + k] = -slope[:, k]
+    free = ~np.concatenate([held["near"].ravel(), np.repeat(held["far"], 2)])
+    q = np.zeros((14, 14))
+    q[np.ix_(free, free)] = np.linalg.inv(design[:, free].T @ design[:, free])
+    for name, begin in (("near", 0), ("far", 6)):
+        for k, own in enumerate(np.asarray(found.cofactors(name))):
+            places = slice(begin + 2 * k, begin + 2 * k + 2)
+            np.testing.assert_allclose(own, q[places, places], atol=1e-9)
+    redundancy = 1 - np.einsum("gi,ij,gj->g", design, q, design)
+    np.testing.assert_allclose(found.redundancy[0][:, 0], redundancy, atol=1e-7)
+    assert found.degrees_of_freedom == len(apart) - np.sum(free)
+    misfit = np.asarray(found.residuals[0][:, 0])
+    np.testing.assert_allclose(design[:, free].T @ misfit, 0, atol=1e-6)
+
+
 def test_a_net_without_a_known_height_needs_a_constraint(net):
     """Its mean as datum gives the pseudoinverse; without one that is told."""
     start = {"height": jnp.zeros(NODES)}
