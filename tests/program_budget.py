@@ -28,6 +28,7 @@ BUDGET = {
     "published": 200,
     "rejection": 1150,
     "reports": 900,
+    "statistics": 400,
     "surveys": 1400,
     "tables": 50,
     "texts": 900,

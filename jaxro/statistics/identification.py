@@ -27,10 +27,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import ndtr
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, ScalarLike
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, ScalarLike
 
 from ..adjustment import critical_values as critical
 from ..adjustment.bisection import bisect
+from ..xla.programs import compiled
 from .explanations import DOUBT, explanations
 from .familywise import largest_w
 from .normalised import Normalised, PerRow
@@ -74,6 +75,7 @@ class Chances(eqx.Module):
     missed: PerRow
 
 
+@compiled(static=("familywise", "draws"))
 def identify(
     known: Normalised,
     key: PRNGKeyArray,
@@ -111,10 +113,11 @@ def identify(
     )
 
 
+@compiled(static=("familywise", "draws"))
 def chances(
     known: Normalised,
     key: PRNGKeyArray,
-    delta: PerRow,
+    delta: Float[ArrayLike, " row"],
     *,
     level: ScalarLike = 0.001,
     familywise: bool = False,

@@ -203,7 +203,10 @@ def test_a_first_call_is_few_programs(compilations):
             lambda level, sigma: Recommended(level=level, sigma=sigma),
             marks=pytest.mark.slow,
         ),
-        lambda level, sigma: Reweighting(Tukey(scale=40 * level), sigma=sigma),
+        pytest.param(
+            lambda level, sigma: Reweighting(Tukey(scale=40 * level), sigma=sigma),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["data-snooping", "recommended", "tukey"],
 )
