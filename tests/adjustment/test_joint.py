@@ -359,6 +359,7 @@ def test_a_bundle_without_control_is_told(bundle):
     assert free.result != RESULTS.successful
 
 
+@pytest.mark.slow
 def test_a_pair_as_one_of_several_terms_is_the_pair():
     """Elements that move in their own way, as a family of two: two pairs at once are
     each of them alone."""

@@ -184,6 +184,7 @@ def test_forward_equals_reverse():
             )
 
 
+@pytest.mark.slow
 def test_masked_points_have_no_derivative():
     for name in FIELDS[:4]:
         for leaf in jax.tree.leaves(getattr(exact(), name)):

@@ -175,6 +175,7 @@ def test_contradictions_are_told_where_no_cause_is_known():
     assert any("known points fit the photos" in sentence for sentence in said)
 
 
+@pytest.mark.slow
 def test_a_bar_is_judged_by_the_block_without_it():
     """The wrong one of three is left out, and no ray in its place; two that contradict
     each other are both told."""

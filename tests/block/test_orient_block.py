@@ -371,6 +371,7 @@ def test_one_of_many_known_points_is_left_out():
     assert np.flatnonzero(np.any(found.wrong.control, axis=1)).tolist() == [3]
 
 
+@pytest.mark.slow
 def test_the_sign_of_a_coordinate_on_two_photos_throws_no_block_off():
     """The rays meet behind the photos: the point is lost, and nothing else."""
     mock = block.mock_block(5, block.Flight(models=4), control_every=2)

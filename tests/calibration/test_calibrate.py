@@ -284,6 +284,7 @@ def test_a_plane_object_is_named(model):
         assert found.result == expected
 
 
+@pytest.mark.slow
 def test_too_little_is_named():
     _, points, places = measured(3)
     for model in (ONE, STRIPS):

@@ -248,6 +248,7 @@ def test_distances_stand_beside_coordinates(tmp_path):
     assert "by distances" in told.stdout
 
 
+@pytest.mark.slow
 def test_a_plane_object_needs_the_principal_place(tmp_path):
     """Else the result has no numbers, and the exit code says it."""
     rng = np.random.default_rng(8)
@@ -294,7 +295,7 @@ def image_and_object():
     return taken(rng, points, np.array([0.0, 0.0, 12.0]), (0.1, -0.1, 0.3)), points
 
 
-SLOW = {"zones without points"}
+SLOW = {"zones without points", "mirrored"}
 CASES = [
     pytest.param(case, marks=pytest.mark.slow if case in SLOW else ()) for case in BAD
 ]

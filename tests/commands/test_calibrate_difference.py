@@ -111,6 +111,7 @@ def test_a_picture_shows_the_difference(tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_an_image_that_cannot_be_used_is_not_compared(tmp_path):
     told = compare(tmp_path, two_photos(tmp_path, few=6))
     assert told.exit_code == 1

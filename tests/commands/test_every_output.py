@@ -10,6 +10,7 @@ import command_line
 import numpy as np
 import pixel_scene as scene
 import pytest
+from tiers import seldom
 
 from jaxro import exchange
 from jaxro.commands.block_request import Options, prepare
@@ -155,7 +156,7 @@ def test_every_output_of_every_input(command, kind, output, inputs, tmp_path):
     assert output == "json" or any(out.iterdir())
 
 
-@pytest.mark.parametrize("kind", INPUTS[:-1])
+@pytest.mark.parametrize("kind", seldom(INPUTS[:-1], ["pairs.csv"]))
 def test_what_was_cleaned_is_read_again_to_the_same_result(kind, inputs, tmp_path):
     """Kept points of cleaned.csv, with the cameras that stand beside it."""
     out = tmp_path / "out"
@@ -259,6 +260,7 @@ def test_pairs_that_nothing_joins_are_no_block(inputs):
     assert done.exit_code == 2 and "photos and points of their own" in done.stderr
 
 
+@pytest.mark.slow
 def test_rejected_points_of_a_table_are_left_out(tmp_path):
     """Other verdicts than those that a cleaning writes are no verdicts."""
     header = "point,x_left,y_left,x_right,y_right,verdict,q_mm\n"

@@ -273,6 +273,7 @@ def test_table_1_is_that_of_the_oracle(paper):
         )
 
 
+@pytest.mark.slow
 def test_the_proposed_algorithm_with_the_papers_count_of_iterations_and_with_the_other(
     paper,
 ):

@@ -126,6 +126,7 @@ def test_bars_of_many_points_are_those_of_the_largest_values():
     assert "not testable" in labels and not any("limit" in text for text in labels)
 
 
+@pytest.mark.slow
 def test_leave_one_out_draws_the_statistic_of_the_procedure(pair):
     procedure = jaxro.rejection.LeaveOneOutGrubbs(exact=False)
     wrong = mock.plant(pair, y_right=jnp.where(jnp.arange(16) == 5, 0.3, 0.0))
