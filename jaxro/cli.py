@@ -16,6 +16,7 @@ except ModuleNotFoundError:
 
 from .commands.lines import options as given
 from .commands.lines.absolute import absolute
+from .commands.lines.adjust import adjust
 from .commands.lines.block import block
 from .commands.lines.calibrate import calibrate
 from .commands.lines.clean import clean
@@ -29,6 +30,7 @@ GROUPS: dict[str, tuple[Callable, ...]] = {
     "Cameras": (calibrate,),
     "Many photos": (block, absolute, colmap),
     "Heights over a grid": (heights, plan),
+    "Geodetic networks": (adjust,),
     "Published papers": (reproduce,),
 }
 """The commands by what they are for, in the order of the help."""

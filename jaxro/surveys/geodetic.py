@@ -1,0 +1,216 @@
+"""Geodetic networks: height differences, distances, directions, angles and vectors
+between points, adjusted together.
+
+    height       Z_b - Z_a
+    slope        |b - a|
+    distance     |b - a| in plan
+    direction    t(a, b) - o, o the orientation of its set
+    angle        t(a, c) - t(a, b)
+    vector       b - a, with a covariance matrix
+    position     a itself: coordinates that are known with a covariance matrix
+    X, Y, Z      one coordinate of a
+
+t(a, b) = arctan2(Y_b - Y_a, X_b - X_a), from the axis of X through that of Y: clockwise
+where X is north and Y is east. Angles are radians. A coordinate that no measurement
+touches is not part of the network; one that is held is known. Where the measurements
+leave the position of the network open, all points together are its datum: of all
+solutions the one next to the approximate coordinates (inner constraints, Meissl 1962).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..adjustment import JointAdjustment, Term, adjust
+from ..statistics.rows import SMALL, rows
+
+Point = Float[Array, "3"]
+
+
+class Measured(NamedTuple):
+    """Measurements of one kind: the numbers of the points of each (`at`; two or three,
+    as the kind has), what was measured, and the lower triangle of the Cholesky factor
+    of its covariance matrix (a standard deviation, of one number). `set`: of a
+    direction the number of its set."""
+
+    kind: str
+    at: Int[np.ndarray, "measurement ends"]
+    values: Float[np.ndarray, "measurement m"]
+    roots: Float[np.ndarray, "measurement m m"]
+    set: Int[np.ndarray, " measurement"] | None = None
+
+
+class Kind(NamedTuple):
+    """A kind of measurement: how many points it joins, how many numbers it has, which
+    coordinates it touches, its function of the points (and of the orientation of its
+    set), and whether it is an angle."""
+
+    ends: int
+    numbers: int
+    touches: tuple[bool, bool, bool]
+    function: Callable
+    is_angle: bool = False
+    has_set: bool = False
+
+
+def azimuth(a: Point, b: Point) -> Float[Array, ""]:
+    """t(a, b), from the axis of X through that of Y."""
+    return jnp.arctan2(b[1] - a[1], b[0] - a[0])
+
+
+PLAN, HEIGHT, SPACE = (True, True, False), (False, False, True), (True, True, True)
+
+KINDS = {
+    "height": Kind(2, 1, HEIGHT, lambda a, b: (b - a)[2:]),
+    "slope": Kind(2, 1, SPACE, lambda a, b: jnp.sqrt(jnp.sum((b - a) ** 2))[None]),
+    "distance": Kind(
+        2, 1, PLAN, lambda a, b: jnp.sqrt(jnp.sum((b - a)[:2] ** 2))[None]
+    ),
+    "direction": Kind(
+        2,
+        1,
+        PLAN,
+        lambda a, b, o: (azimuth(a, b) - o[0])[None],
+        is_angle=True,
+        has_set=True,
+    ),
+    "angle": Kind(
+        3,
+        1,
+        PLAN,
+        lambda a, b, c: (azimuth(a, c) - azimuth(a, b))[None],
+        is_angle=True,
+    ),
+    "vector": Kind(2, 3, SPACE, lambda a, b: b - a),
+    "position": Kind(1, 3, SPACE, lambda a: a),
+    "X": Kind(1, 1, (True, False, False), lambda a: a[:1]),
+    "Y": Kind(1, 1, (False, True, False), lambda a: a[1:2]),
+    "Z": Kind(1, 1, HEIGHT, lambda a: a[2:]),
+}
+"""All kinds by name."""
+
+
+class Network(NamedTuple):
+    """A network: approximate `coordinates` of its points, which of these are `held`,
+    and what is measured."""
+
+    coordinates: Float[np.ndarray, "point 3"]
+    held: Bool[np.ndarray, "point 3"]
+    measured: tuple[Measured, ...]
+
+    @property
+    def touched(self) -> Bool[np.ndarray, "point 3"]:
+        """The coordinates that a measurement touches."""
+        found = np.zeros(self.held.shape, bool)
+        for part in self.measured:
+            found[part.at.ravel()] |= KINDS[part.kind].touches
+        return found
+
+    @property
+    def sets(self) -> int:
+        """How many sets of directions there are."""
+        numbers = [p.set for p in self.measured if p.set is not None and len(p.set)]
+        return 1 + max((int(np.max(number)) for number in numbers), default=-1)
+
+
+class Solution(NamedTuple):
+    """An adjusted network, with its `terms` and what was held; `datum`: how many numbers
+    of position, rotation and scale the measurements left open."""
+
+    network: Network
+    adjusted: JointAdjustment
+    terms: tuple[Term, ...]
+    held: dict[str, Bool[np.ndarray, "_ _"]]
+    datum: int
+
+    @property
+    def coordinates(self) -> Float[np.ndarray, "point 3"]:
+        return np.asarray(self.adjusted.parameters["point"])
+
+
+def adjust_network(network: Network) -> Solution:
+    """The network adjusted by least squares; the standard deviations are true ones if
+    sigma0 is 1."""
+    terms = tuple(_term(part) for part in network.measured)
+    start = {"point": jnp.asarray(network.coordinates)}
+    held = {"point": network.held | ~network.touched}
+    if network.sets:
+        start["orientation"] = jnp.asarray(_orientations(network))[:, None]
+        held["orientation"] = np.zeros((network.sets, 1), bool)
+    open_ways = _open_ways(terms, start, held)
+    constraints = None
+    if len(open_ways):
+        of_points = jnp.asarray(open_ways[:, : network.held.size])
+        constraints = _InnerConstraints(of_points, start["point"])
+    adjusted = adjust(terms, start, held=held, constraints=constraints)
+    return Solution(network, adjusted, terms, held, len(open_ways))
+
+
+class _Condition(eqx.Module):
+    """function(points) - (l + L v) = 0 of one kind, v white."""
+
+    kind: str = eqx.field(static=True)
+
+    def __call__(self, *given: Array | tuple[Array, ...]) -> Float[Array, " m"]:
+        *blocks, (white, values, root) = given
+        kind = KINDS[self.kind]
+        off = kind.function(*blocks) - values
+        if kind.is_angle:
+            # the nearest of all full turns, which no derivative sees
+            off = off - 2 * jnp.pi * jnp.round(off / (2 * jnp.pi))
+        return off - root @ white
+
+
+def _term(part: Measured) -> Term:
+    touches = [("point", part.at[:, end]) for end in range(KINDS[part.kind].ends)]
+    if part.set is not None:
+        touches.append(("orientation", part.set))
+    white = np.zeros(part.values.shape)
+    return Term(
+        _Condition(part.kind),
+        (white, part.values, part.roots),
+        (1.0, None, None),
+        touches=touches,
+    )
+
+
+def _orientations(network: Network) -> Float[np.ndarray, " set"]:
+    """Approximate orientations of all sets, the mean directions of t - l."""
+    turns = np.zeros(network.sets, complex)
+    for part in network.measured:
+        if part.set is None:
+            continue
+        away = network.coordinates[part.at[:, 1]] - network.coordinates[part.at[:, 0]]
+        off = np.arctan2(away[:, 1], away[:, 0]) - part.values[:, 0]
+        np.add.at(turns, part.set, np.exp(1j * off))
+    return np.angle(turns)
+
+
+def _open_ways(
+    terms: tuple[Term, ...], start: dict[str, Array], held: dict[str, np.ndarray]
+) -> Float[np.ndarray, "way p"]:
+    """Displacements of all free parameters that change no measurement, orthonormal."""
+    design = rows(terms, start, held=held).design
+    free = ~np.concatenate([held[name].ravel() for name in start])
+    length = np.linalg.norm(design, axis=0)
+    scale = np.where(length > 0, length, 1.0)
+    _, size, ways = np.linalg.svd((design / scale)[:, free])
+    rank = int(np.sum(size > SMALL * np.max(size, initial=0.0)))
+    found = np.zeros((np.sum(free) - rank, len(free)))
+    found[:, free] = ways[rank:]
+    left, *_ = np.linalg.svd((found / scale).T, full_matrices=False)
+    return left.T
+
+
+class _InnerConstraints(eqx.Module):
+    """No displacement of the points along the ways that are open."""
+
+    ways: Float[Array, "way own"]
+    at: Float[Array, "point 3"]
+
+    def __call__(self, parameters: dict[str, Array]) -> Float[Array, " way"]:
+        return self.ways @ (parameters["point"] - self.at).ravel()
