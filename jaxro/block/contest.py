@@ -258,7 +258,7 @@ def _of_single_points(
     own = ~ground.check & ~ground.station
     rows = np.flatnonzero(own & np.any(np.isfinite(ground.coordinates), axis=1))
     model = known_in_chain(given.block, chained, ground)
-    without = {int(k): _without(ground, k) for k in rows}
+    without = {k: _without(ground, k) for k in rows.tolist()}
     sizes = {k: _misplaced(model, left) for k, left in without.items()}
     for k in sorted(sizes, key=lambda k: sizes[k])[:TRIED]:
         if np.isfinite(sizes[k]):

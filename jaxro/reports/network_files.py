@@ -6,13 +6,19 @@ from functools import cached_property
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from ..adjustment import RESULTS, critical_values as critical
 from ..statistics.explanations import explanations
 from ..statistics.familywise import largest_tau, largest_w
-from ..statistics.groups import GroupTests, assess_groups
+from ..statistics.groups import (
+    GroupTests,
+    assess_groups,
+    estimated_probability,
+    probability,
+)
 from ..statistics.identification import Identified, identify
 from ..statistics.normalised import Normalised
 from ..statistics.rows import Rows, normalise_rows, rows
@@ -125,8 +131,9 @@ class Done:
     @cached_property
     def tests(self) -> GroupTests:
         """Of every measurement, all its numbers together."""
-        unit = 1.0 if self.sigma_known else max(self.sigma0, 1e-300)
-        return assess_groups(self.normalised, self.measurement, unit)
+        return assess_groups(
+            self.normalised, self.measurement, sigma0_known=self.sigma_known
+        )
 
     @cached_property
     def is_scalar(self) -> bool:
@@ -141,7 +148,11 @@ class Done:
         if not self.is_scalar:
             count = max(int(np.sum(self.tests.freedom > 0)), 1)
             return float(critical.sidak(self.level, count))
-        return float(critical.chi_squared_p(self.largest**2, 1))
+        if self.sigma_known:
+            return float(probability(self.largest**2, 1))
+        square = (self.largest * self.sigma0) ** 2
+        squares = self.freedom * self.sigma0**2
+        return float(estimated_probability(square, 1, squares, self.freedom))
 
     @cached_property
     def largest(self) -> float:
@@ -162,7 +173,7 @@ class Done:
             return [worst]
         row = int(np.argmax(np.abs(np.asarray(self.normalised.w))))
         named = explanations(
-            self.normalised, np.asarray(row), estimated=not self.sigma_known
+            self.normalised, jnp.asarray(row), estimated=not self.sigma_known
         )
         return np.flatnonzero(np.asarray(named)).tolist()
 

@@ -1,7 +1,7 @@
 """Tables of points on the ground: CSV text in, `GroundPoints` out, or one clear error.
 
-point, X, Y, Z, blank where a coordinate is not known; optionally sX, sY, sZ, or sigma
-for all three (0: without error), and role:
+point, X, Y, Z, blank where a coordinate is not known (X and Y, or Z, may have no column
+at all); optionally sX, sY, sZ, or sigma for all (0: without error), and role:
 
 control       it takes part in an adjustment (also where the field is blank)
 check         the result is only compared with it
@@ -26,10 +26,12 @@ ROLES = ("control", "check", "approximate")
 STATION = "station"
 SHORT = {"s_x": "sx", "s_y": "sy", "s_z": "sz"}
 TEXTS = ("point", "role")
+COORDINATES = "point,X,Y,Z, blank where a coordinate is not known; or X,Y or Z alone"
+"""The columns of a table of points, as errors tell them."""
 
 GROUND = Columns(
-    ("point", *AXES),
-    (*DEVIATIONS, "sigma", "role"),
+    ("point",),
+    (*AXES, *DEVIATIONS, "sigma", "role"),
     SHORT,
     texts=TEXTS,
 )
@@ -122,8 +124,15 @@ def parse(
 
 
 def _check_columns(row: Row) -> None:
-    """Raises TableError for standard deviations of some axes only, or both kinds."""
+    """Raises TableError for coordinates or standard deviations of some axes only, or both
+    kinds of these."""
+    missing = [axis for axis in AXES if axis not in row.cells]
+    if missing not in ([], ["z"], ["x", "y"]):
+        raise TableError(
+            row.file, column=missing[0], found="no such column", expected=COORDINATES
+        )
     there = [column for column in DEVIATIONS if column in row.cells]
+    wanted = [column for column in DEVIATIONS if column[1:] in row.cells]
     if there and "sigma" in row.cells:
         raise TableError(
             row.file,
@@ -131,11 +140,10 @@ def _check_columns(row: Row) -> None:
             found=f"it beside {there[0]}",
             expected="sX, sY and sZ, or sigma for all three",
         )
-    if there and len(there) < len(DEVIATIONS):
-        missing = next(column for column in DEVIATIONS if column not in there)
+    if there and (lost := [column for column in wanted if column not in there]):
         raise TableError(
             row.file,
-            column=missing,
+            column=lost[0],
             found=f"no such column beside {there[0]}",
             expected="sX, sY and sZ, or sigma for all three",
         )
@@ -143,7 +151,7 @@ def _check_columns(row: Row) -> None:
 
 def _coordinates(row: Row) -> list[float]:
     """X, Y, Z, NaN where a field is blank. Raises TableError where all are."""
-    found = [_number(row, axis) if row.cells[axis] else np.nan for axis in AXES]
+    found = [_number(row, axis) if row.cells.get(axis) else np.nan for axis in AXES]
     if np.all(np.isnan(found)):
         raise row.error(
             "x",

@@ -1,0 +1,115 @@
+"""`jaxro adjust`: published nets, what is named, what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+from command_line import run, words
+
+SIKI = """\
+from,to,difference,sigma
+1,2,-0.749,0.00077
+1,3,-1.274,0.00126
+1,4,-2.89,0.00098
+2,3,-0.53,0.00105
+2,4,-2.141,0.00133
+3,4,-1.614,0.00063
+"""
+"""A net of levelling of the course of OSGeoLabBp (level_net), .7 mm a kilometre."""
+
+MIKHAIL = """\
+from,to,difference,length_km
+A,B,25.42,18.1
+B,C,10.34,9.4
+C,A,-35.2,14.2
+B,D,-15.54,17.6
+D,E,21.32,13.5
+E,C,4.82,9.9
+E,A,-31.02,13.8
+C,D,-26.11,14.0
+"""
+"""Mikhail and Ackermann 1976, table 7-1; variance .1 for a kilometre."""
+
+
+def adjusted(folder, network, points="", *options):
+    """The summary of a call."""
+    (folder / "network.csv").write_text(network)
+    given = [folder / "network.csv"]
+    if points:
+        (folder / "points.csv").write_text(points)
+        given += ["--points", folder / "points.csv"]
+    told = run("adjust", *given, "--json", *options)
+    assert told.exit_code in (0, 1), told.output
+    return json.loads(told.stdout)
+
+
+def test_a_published_net_to_its_printed_digits(tmp_path):
+    found = adjusted(tmp_path, SIKI, "point,Z\n4,101.345\n", "--unknown-sigma0")
+    heights = [found["points"][name]["coordinates"][2] for name in "123"]
+    spread = [found["points"][name]["deviations"][2] for name in "123"]
+    np.testing.assert_array_equal(np.round(heights, 4), [104.2350, 103.4868, 102.9588])
+    np.testing.assert_array_equal(np.round(spread, 5), [0.00113, 0.00119, 0.00091])
+    assert round(found["sigma0"], 2) == 1.65 and found["usable"]
+    assert found["points"]["4"]["deviations"] == [None, None, 0.0]
+
+
+def test_weights_by_the_length_of_lines(tmp_path):
+    """Redundancy 4 and sigma0 .2011 of the weights 10 / km."""
+    found = adjusted(tmp_path, MIKHAIL, "point,Z\nA,800\n")
+    assert found["degrees_of_freedom"] == 4 and not found["sigma_known"]
+    np.testing.assert_allclose(found["sigma0"] / np.sqrt(0.1), 0.2011, atol=5e-5)
+    free = adjusted(tmp_path, MIKHAIL)
+    assert free["datum"] == 1 and free["sigma0"] == pytest.approx(found["sigma0"])
+    for one, other in zip(found["measurements"], free["measurements"], strict=True):
+        assert one["tau"] == pytest.approx(other["tau"], abs=1e-9)
+
+
+def test_the_wrong_measurement_of_the_example_is_named(tmp_path):
+    told = run("adjust", "--out", tmp_path / "out")
+    assert told.exit_code == 1
+    assert "distance 3-2 is wrong" in told.stdout
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        *("points.csv", "measurements.csv", "summary.json"),
+    }
+
+
+def test_legs_of_one_line_are_named_together(tmp_path):
+    """Of a point between two legs nothing tells which is wrong."""
+    net = "from,to,difference,sigma\n" + "".join(
+        f"{a},{b},{rise},0.001\n"
+        for a, b, rise in (
+            ("a", "m", 1),
+            ("m", "b", 1.02),
+            ("a", "b", 2),
+            ("a", "b", 2),
+        )
+    )
+    told = adjusted(tmp_path, net, "point,Z\na,10\n")
+    assert told["wrong"] == ["a-m", "m-b"] and not told["usable"]
+
+
+@pytest.mark.parametrize(
+    ("network", "said"),
+    [
+        ("from,to,difference\na,b,1\n", "line 2, column sigma: found nothing"),
+        ("from,to,value,sigma\na,b,1,1\n", "column kind: found no such column"),
+        ("kind,from,to,value,sigma\nslant,a,b,1,1\n", "column kind: found 'slant'"),
+        ("kind,from,to,value,sigma\nheight,a,a,1,1\n", "column to: found 'a'"),
+        ("kind,from,to,value,sigma\nheight,a,b,1,0\n", "expected a number above 0"),
+        ("kind,from,to,value,sigma\nangle,a,b,1,1\n", "column other: found no such"),
+        ("from,to,dX,dY,dZ,sigma\na,b,1,2,x,1\n", "column dz: found 'x'"),
+        (
+            "from,to,dX,dY,dZ,sX,sY,sZ,cXY\na,b,1,2,3,1,1,1,2\n",
+            "a covariance matrix that is not positive",
+        ),
+        (
+            "kind,from,to,value,sigma\ndistance,a,b,1,1\n",
+            "no approximate coordinates of point 'a'",
+        ),
+    ],
+)
+def test_bad_tables_say_where(network, said, tmp_path):
+    (tmp_path / "network.csv").write_text(network)
+    told = run("adjust", tmp_path / "network.csv", "--out", tmp_path / "out")
+    assert told.exit_code == 2 and said in words(told.output), told.output
+    assert not (tmp_path / "out").exists()
