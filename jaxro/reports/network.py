@@ -5,9 +5,12 @@ from rich.console import Console
 
 from ..surveys.geodetic import KINDS
 from .network_files import AXES, Done
-from .pair import digits, table
+from .pair import digits, join_names, table
 from .rows import left_out, most_rows
 from .text import escape, number
+
+SHOWN = 10
+"""Names that a sentence tells of a longer list."""
 
 
 def show(console: Console, done: Done) -> None:
@@ -38,6 +41,12 @@ def show(console: Console, done: Done) -> None:
 
 def _verdict(done: Done) -> str:
     """What came of it, in one sentence."""
+    if done.loose:
+        return (
+            "[bold red]not determined[/bold red]: nothing tells where the points "
+            f"{escape(join_names(done.loose, SHOWN))} lie from those that are known; "
+            "join them by more measurements, or give more known coordinates"
+        )
     if done.result == "rank_deficient":
         return (
             "[bold red]not determined[/bold red]: the measurements do not determine all "

@@ -52,7 +52,14 @@ class Done:
     # what came of it
 
     @property
+    def loose(self) -> list[str]:
+        """The points that are not determined, though others are known."""
+        return [self.names[k] for k in np.flatnonzero(self.solution.loose)]
+
+    @property
     def result(self) -> str:
+        if self.loose:
+            return "not_determined"
         result = int(self.solution.adjusted.result._value)
         return next(
             name

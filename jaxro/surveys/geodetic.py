@@ -31,6 +31,10 @@ from ..statistics.rows import SMALL, rows
 Point = Float[Array, "3"]
 
 
+STILL = 1e-6
+"""Part of an open way below which a point does not move along it."""
+
+
 class Measured(NamedTuple):
     """Measurements of one kind: the numbers of the points of each (`at`; two or three,
     as the kind has), what was measured, and the lower triangle of the Cholesky factor
@@ -111,6 +115,15 @@ class Network(NamedTuple):
         return found
 
     @property
+    def known(self) -> Bool[np.ndarray, "point 3"]:
+        """The coordinates that are held or known with a deviation."""
+        found = self.held.copy()
+        for part in self.measured:
+            if KINDS[part.kind].ends == 1:
+                found[part.at[:, 0]] |= KINDS[part.kind].touches
+        return found & self.touched
+
+    @property
     def sets(self) -> int:
         """How many sets of directions there are."""
         numbers = [p.set for p in self.measured if p.set is not None and len(p.set)]
@@ -119,13 +132,16 @@ class Network(NamedTuple):
 
 class Solution(NamedTuple):
     """An adjusted network, with its `terms` and what was held; `datum`: how many numbers
-    of position, rotation and scale the measurements left open."""
+    of position, rotation and scale the measurements left open; `loose`: the points that
+    these move although others are known in the same coordinates, and which therefore
+    are not determined."""
 
     network: Network
     adjusted: JointAdjustment
     terms: tuple[Term, ...]
     held: dict[str, Bool[np.ndarray, "_ _"]]
     datum: int
+    loose: Bool[np.ndarray, " point"]
 
     @property
     def coordinates(self) -> Float[np.ndarray, "point 3"]:
@@ -147,7 +163,10 @@ def adjust_network(network: Network) -> Solution:
         of_points = jnp.asarray(open_ways[:, : network.held.size])
         constraints = _InnerConstraints(of_points, start["point"])
     adjusted = adjust(terms, start, held=held, constraints=constraints)
-    return Solution(network, adjusted, terms, held, len(open_ways))
+    moved = np.max(np.abs(open_ways[:, : network.held.size]), axis=0, initial=0.0)
+    is_moved = moved.reshape(network.held.shape) > STILL
+    loose = np.any(is_moved & np.any(network.known, axis=0), axis=1)
+    return Solution(network, adjusted, terms, held, len(open_ways), loose)
 
 
 class _Condition(eqx.Module):

@@ -88,6 +88,17 @@ def test_legs_of_one_line_are_named_together(tmp_path):
     assert told["wrong"] == ["a-m", "m-b"] and not told["usable"]
 
 
+def test_points_that_nothing_joins_to_known_ones_are_named(tmp_path):
+    apart = MIKHAIL + "P,Q,1.5,2.0\nQ,R,0.5,2.0\nP,R,2.0,2.0\n"
+    (tmp_path / "network.csv").write_text(apart)
+    (tmp_path / "points.csv").write_text("point,Z\nA,800\n")
+    told = run("adjust", tmp_path / "network.csv", "--points", tmp_path / "points.csv")
+    assert told.exit_code == 1
+    assert "not determined: nothing tells where the points P, Q, R" in words(
+        told.stdout
+    )
+
+
 @pytest.mark.parametrize(
     ("network", "said"),
     [
