@@ -25,6 +25,7 @@ from ..statistics.rows import Rows, normalise_rows, rows
 from ..surveys.geodetic import KINDS, Solution
 from ..tables.ground import GroundPoints
 from ..tables.network import Measurement
+from ..xla.programs import compiled
 from . import files
 
 AXES = ("X", "Y", "Z")
@@ -165,7 +166,7 @@ class Done:
     def largest(self) -> float:
         """What the largest |w| (|tau|) exceeds with the probability `level`."""
         limit = largest_w if self.sigma_known else largest_tau
-        return float(limit(self.level, self.normalised))
+        return float(compiled(limit)(self.level, self.normalised))
 
     @cached_property
     def wrong(self) -> list[int]:
@@ -179,7 +180,7 @@ class Done:
         if not self.is_scalar:
             return [worst]
         row = int(np.argmax(np.abs(np.asarray(self.normalised.w))))
-        named = explanations(
+        named = compiled(explanations, static=("estimated",))(
             self.normalised, jnp.asarray(row), estimated=not self.sigma_known
         )
         return np.flatnonzero(np.asarray(named)).tolist()

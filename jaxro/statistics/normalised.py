@@ -11,14 +11,18 @@ tells whether the error is in i or in j. With one degree of freedom every |rho| 
 All n² correlations follow from p numbers a row.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..adjustment.critical_values import UNTESTABLE
 
 PerRow = Float[Array, " row"]
+Given = Float[Array | np.ndarray, " row"]
+Used = Bool[Array | np.ndarray, " row"]
 
 
 class Normalised(NamedTuple):
@@ -60,25 +64,26 @@ class Normalised(NamedTuple):
 
 
 def normalise(
-    residuals: PerRow,
-    spanned: list[PerRow],
-    use: Bool[Array, " row"],
-    squares: Float[Array, ""],
+    residuals: Given,
+    spanned: Sequence[Given],
+    use: Used,
+    squares: ArrayLike,
 ) -> Normalised:
     """The normalised residuals of whitened `residuals`; `spanned`: p columns that span
     those of the design and are orthonormal over the rows in `use`; `squares`: Σ r² of
-    these."""
-    redundancy = jnp.where(use, 1 - sum(q * q for q in spanned), 0.0)
+    these. Numbers of NumPy stay there until the end."""
+    xp: Any = np if isinstance(residuals, np.ndarray) else jnp
+    redundancy = xp.where(use, 1 - sum(q * q for q in spanned), 0.0)
     tested = use & (redundancy > UNTESTABLE)
-    root = jnp.sqrt(jnp.where(tested, redundancy, 1.0))
-    scale = lambda values: jnp.where(tested, values / root, 0.0)
-    basis = jnp.stack([scale(q) for q in spanned], axis=-1)
-    rows = jnp.sum(use.astype(basis.dtype))
+    root = xp.sqrt(xp.where(tested, redundancy, 1.0))
+    scale = lambda values: xp.where(tested, values / root, 0.0)
+    basis = xp.stack([scale(q) for q in spanned], axis=-1)
+    rows = xp.sum(use.astype(basis.dtype))
     return Normalised(
-        w=scale(residuals),
-        basis=basis,
-        redundancy=redundancy,
-        tested=tested,
-        squares=squares,
-        freedom=jnp.maximum(rows - len(spanned), 0.0),
+        w=jnp.asarray(scale(residuals)),
+        basis=jnp.asarray(basis),
+        redundancy=jnp.asarray(redundancy),
+        tested=jnp.asarray(tested),
+        squares=jnp.asarray(squares),
+        freedom=jnp.asarray(xp.maximum(rows - len(spanned), 0.0)),
     )

@@ -86,9 +86,4 @@ def normalise_rows(given: Rows) -> Normalised:
     columns = np.zeros((spanned.shape[1], len(use)))
     columns[:, use] = spanned.T
     residuals = np.where(use, given.residuals, 0.0)
-    return normalise(
-        jnp.asarray(residuals),
-        [jnp.asarray(column) for column in columns],
-        jnp.asarray(use),
-        jnp.asarray(np.sum(residuals**2)),
-    )
+    return normalise(residuals, list(columns), use, np.sum(residuals**2))

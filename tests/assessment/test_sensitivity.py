@@ -191,6 +191,7 @@ def test_masked_points_have_no_derivative():
             assert np.all(leaf[..., POINTS:] == 0) and np.any(leaf[..., :POINTS])
 
 
+@pytest.mark.slow
 def test_unusable_orientations_have_no_derivative():
     assert exact().usable.tolist() == [True, True, False]
     assert not any(

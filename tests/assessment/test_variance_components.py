@@ -131,6 +131,7 @@ def test_y_of_left_and_right_photo():
         assert abs(float(result.sigma[k]) - sigma) < 2 * float(result.standard_error[k])
 
 
+@pytest.mark.slow
 def test_what_is_not_estimable_is_told():
     """Near-vertical pairs know y of both photos only together, and nothing of x."""
     pairs, found = batch(NEAR, "by photo")

@@ -322,6 +322,7 @@ def test_bad_input_says_where_and_writes_nothing(case, image_and_object, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_images_that_cannot_be_calibrated_are_named(tmp_path):
     control, _, known = files(tmp_path, 0.0)
     lines = control.read_text().splitlines()

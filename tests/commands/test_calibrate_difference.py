@@ -121,6 +121,7 @@ def test_an_image_that_cannot_be_used_is_not_compared(tmp_path):
     assert tested["F"] == "" and not (tmp_path / "out" / "difference.csv").exists()
 
 
+@pytest.mark.slow
 def test_accuracies_that_differ_are_said(tmp_path):
     """The test takes both sigma0 to be the same."""
     photos, known = two_photos(tmp_path)

@@ -7,9 +7,10 @@ import examples
 import numpy as np
 import pytest
 from command_line import run, words
+from tiers import seldom
 
 
-@pytest.mark.parametrize("name", examples.ARGUMENTS)
+@pytest.mark.parametrize("name", seldom(examples.ARGUMENTS, ["orient", "block"]))
 def test_json_is_the_summary_and_nothing_else(name, example):
     told = example(name)
     assert told.json_code == 0

@@ -154,6 +154,7 @@ app(["orient", sys.argv[1], "--focal", "100", "--out", sys.argv[2]], prog_name="
 """
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_at_once_and_what_was_done_is_kept(folder):
     """While programs are compiled, too, of which XLA then goes on reading the text."""
     out, unfinished = folder / "interrupted", folder / "interrupted.unfinished"

@@ -303,6 +303,7 @@ def test_the_proposed_algorithm_with_the_papers_count_of_iterations_and_with_the
     assert 0.45 < paper.named_exactly[1] < 0.7 and paper.named_exactly[2] == 0
 
 
+@pytest.mark.slow
 def test_the_ten_points_of_the_introduction(paper):
     """The sign of table 1: +2.0 mm at point 7. Printed residuals within 8 hundredths,
     and the same two points go."""

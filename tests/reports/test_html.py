@@ -94,6 +94,7 @@ def test_names_are_no_markup(many):
     assert ODD_NAME in shown(page)
 
 
+@pytest.mark.slow
 def test_report_of_many_pairs_details_the_worst(many):
     page, told = many[0].read_text(encoding="utf-8"), many[1]
     assert page.count("id=pair-") == 100
