@@ -131,6 +131,7 @@ def test_small_errors_leave_the_deviations():
     np.testing.assert_allclose(interval.least, -width, rtol=2e-2)
 
 
+@pytest.mark.slow
 def test_an_end_within_the_region_is_found():
     """No direction has a larger component along x than 1, and x is in the region."""
     pair, _, found = first()
@@ -140,6 +141,7 @@ def test_an_end_within_the_region_is_found():
     assert most[0] == pytest.approx(1.0, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_what_has_no_sigma0_has_no_end():
     pair, truth, found = first()
     found = dataclasses.replace(

@@ -123,6 +123,7 @@ def test_sigma_is_in_the_unit_of_the_coordinates_and_a_multiple_of_the_pair_s(sm
     )
 
 
+@pytest.mark.slow
 def test_what_tells_no_noise_is_refused():
     """Pairs of five points, and pairs without a common point; as many places as above,
     so that the same programs serve."""

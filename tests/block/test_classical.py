@@ -142,6 +142,7 @@ def test_what_it_loses_in_a_strip_of_ten():
     assert len(as_text(rows).splitlines()) == 1 + len(rows)
 
 
+@pytest.mark.slow
 def test_deviations_within_a_model_are_those_of_its_pair(strip):
     """`model_of_pair` has them from cofactors, without the second order of the
     residuals."""

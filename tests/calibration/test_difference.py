@@ -64,6 +64,7 @@ def test_nothing_differs_but_the_pose():
     assert found.above == 7
 
 
+@pytest.mark.slow
 def test_the_statistic_is_that_of_an_independent_adjustment():
     """Brown's coefficients in common against coefficients of each, in NumPy."""
     rng = np.random.default_rng(4)

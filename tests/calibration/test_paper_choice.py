@@ -61,6 +61,7 @@ def test_the_rules_of_the_paper():
     assert found.by_score == 1  # the film is stretched along x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "models", [MODELS, pytest.param(paper_models(), marks=pytest.mark.slow)]
 )

@@ -15,6 +15,7 @@ def rays_of(stations, points, image, point):
     return every[image, point]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("depth", "focal_sigma"),
     [

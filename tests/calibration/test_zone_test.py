@@ -54,6 +54,7 @@ def test_the_statistic_is_that_of_an_independent_solution():
     assert found.probability < 1e-3
 
 
+@pytest.mark.slow
 def test_what_cannot_be_tested_is_refused_or_named():
     _, points, places = measured(3)
     whole = image(points, places)

@@ -131,6 +131,7 @@ def assert_same(folder, command, table, without=()):
                 assert float(text) == value, name
 
 
+@pytest.mark.slow
 def test_oriented_pairs_have_the_same_figures(folder):
     assert len(set(run("orient", folder))) == 1
     for table in TABLES:
@@ -160,6 +161,7 @@ def test_cleaned_pairs_have_the_same_figures(folder):
     assert pq.read_table(folder / "clean_parquet" / "residuals").num_rows == kept
 
 
+@pytest.mark.slow
 def test_what_holds_no_number_is_no_point_that_was_rejected(tmp_path):
     """And harms no other pair."""
     columns, found = measure(3), {}

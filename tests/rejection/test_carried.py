@@ -49,6 +49,7 @@ def test_photos_that_only_turn_have_no_base_whatever_wrong_points_say():
     assert np.sum(lost[still]) <= 1
 
 
+@pytest.mark.slow
 def test_points_in_space_carry_their_base():
     successful, _, _, (_, base) = cleaned(scenes.weak_bases("space", 24, POINTS, 0.3))
     assert np.sum(successful) >= 23
