@@ -141,7 +141,6 @@ def test_an_end_within_the_region_is_found():
     assert most[0] == pytest.approx(1.0, abs=1e-7)
 
 
-@pytest.mark.slow
 def test_what_has_no_sigma0_has_no_end():
     pair, truth, found = first()
     found = dataclasses.replace(
