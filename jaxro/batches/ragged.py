@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
 from ..geometry.cofactor_roots import UNIT, CofactorRoots
-from ..geometry.pairs import Pair, double, pair, with_roots
+from ..geometry.pairs import Pair, double, pair, with_roots, with_score
 from ..orientation.result import PER_POINT, Orientation
 from ..orientation.starts import AbstractStart, Auto
 from ..rejection import AbstractProcedure, Rejection
@@ -39,7 +39,8 @@ Flat = Float[np.ndarray, " row"]
 
 class Ragged(NamedTuple):
     """Pairs of any lengths one behind the other, in NumPy: pair k has the rows
-    `begins[k]` to `begins[k + 1]`. `roots` as of a `Pair`, for every row."""
+    `begins[k]` to `begins[k + 1]`. `roots` and `score` as of a `Pair`, for every
+    row."""
 
     begins: Int[np.ndarray, " pairs+1"]
     x_left: Flat
@@ -51,6 +52,7 @@ class Ragged(NamedTuple):
     focal_left: Float[np.ndarray, " pair"]
     focal_right: Float[np.ndarray, " pair"]
     roots: CofactorRoots | None = None
+    score: Flat | None = None
 
     @property
     def lengths(self) -> Int[np.ndarray, " pair"]:
@@ -69,6 +71,7 @@ class Ragged(NamedTuple):
             self.sigma,
             self.mask,
             *(self.roots or ()),
+            *(() if self.score is None else (self.score,)),
         )
         if last - first + 1 == len(members) and np.all(
             lengths == size
@@ -91,7 +94,7 @@ class Ragged(NamedTuple):
             there = np.arange(size)[None, :] < lengths[:, None]
             fields[5] = np.logical_and(fields[5], there)
         of_pairs = self.focal_left[members], self.focal_right[members]
-        structure = _structure(self.roots is not None)
+        structure = _structure(self.roots is not None, self.score is not None)
         return jax.tree.unflatten(structure, [*fields[:6], *of_pairs, *fields[6:]])
 
     def gather(
@@ -117,10 +120,12 @@ class Ragged(NamedTuple):
 
 
 @lru_cache
-def _structure(roots: bool) -> Any:
-    """Of a `Pair`, with roots or without, to be filled with arrays of NumPy."""
+def _structure(roots: bool, score: bool) -> Any:
+    """Of a `Pair`, with roots and score or without, to be filled with arrays of
+    NumPy."""
     one = pair(*np.zeros((4, 1)), focal=1.0)
-    return jax.tree.structure(with_roots(one) if roots else one)
+    one = with_roots(one) if roots else one
+    return jax.tree.structure(with_score(one) if score else one)
 
 
 def join(pairs: Sequence[Pair]) -> Ragged:
@@ -134,6 +139,8 @@ def join(pairs: Sequence[Pair]) -> Ragged:
         )
     if any(one.roots is not None for one in pairs):
         pairs = [with_roots(one) for one in pairs]
+    if any(one.score is not None for one in pairs):
+        pairs = [with_score(one) for one in pairs]
     begins = np.cumsum([0] + [one.x_left.shape[-1] for one in pairs])
     together = lambda *fields: (
         np.concatenate(fields) if np.ndim(fields[0]) else np.stack(fields)
@@ -156,6 +163,12 @@ def concatenate(parts: Sequence[Ragged]) -> Ragged:
     """The pairs of several `Ragged` one behind the other."""
     if any(part.roots is not None for part in parts):
         parts = [with_roots_of_rows(part) for part in parts]
+    if any(part.score is not None for part in parts):
+        unknown = lambda part: np.full(len(part.x_left), np.nan)
+        parts = [
+            part._replace(score=unknown(part)) if part.score is None else part
+            for part in parts
+        ]
     ends = np.cumsum([0] + [part.begins[-1] for part in parts])
     begins = np.concatenate(
         [[0], *(part.begins[1:] + end for part, end in zip(parts, ends, strict=False))]

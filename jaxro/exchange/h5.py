@@ -137,7 +137,7 @@ def _read_pair(held: _Held, number: int, warnings: list[str]) -> Match:
         for camera, pixels in zip(("camera1", "camera2"), places, strict=True)
     ]
     (left, focal_left, first), (right, focal_right, second) = both
-    seen = first & second
+    seen, scores = first & second, _read_scores(held, number, len(first))
     if not np.all(seen):
         warnings.append(
             f"{held.path}: in pair {name!r} {int(np.sum(~seen))} of {len(seen)} "
@@ -154,7 +154,21 @@ def _read_pair(held: _Held, number: int, warnings: list[str]) -> Match:
         left=left.choose(seen),
         right=right.choose(seen),
         focals=(focal_left, focal_right),
+        score=None if scores is None else scores[seen],
     )
+
+
+def _read_scores(held: _Held, number: int, matches: int) -> np.ndarray | None:
+    """The scores of the matches of a pair, where it has any. Raises TableError."""
+    for name in h5_child.SCORES:
+        key = f"{number}/{name}"
+        if held.is_there(key):
+            scores = held.numbers(key)
+            if scores.shape != (matches,):
+                found = f"shape {scores.shape}"
+                raise held.error(key, found, f"a score for each of {matches} matches")
+            return scores
+    return None
 
 
 def _read_pixels(held: _Held, key: str) -> pixels.Pixels:

@@ -17,8 +17,10 @@ from contextlib import suppress
 from typing import Any
 
 PAIR = "x1", "x2", "camera1", "camera2"
+SCORES = "scores", "matching_scores0"
 CAMERA = "model", "width", "height", "params"
-"""The entries that are read, of a pair and of its cameras."""
+"""The entries that are read, of a pair, of its matches where there are any, and of its
+cameras."""
 
 REFUSED = 3
 """Exit code of what is refused."""
@@ -64,7 +66,9 @@ class Reader:
             self.place = name
             entry = self._find(self.file, name)
             self._keep(
-                str(number), entry, lambda key: PAIR if "/" not in key else CAMERA
+                str(number),
+                entry,
+                lambda key: (*PAIR, *SCORES) if "/" not in key else CAMERA,
             )
 
     def _keep(self, key: str, entry: Any, wanted: Callable[[str], Any]) -> None:

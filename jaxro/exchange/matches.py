@@ -19,7 +19,7 @@ from ..geometry.cofactor_roots import CofactorRoots, from_covariances
 from ..geometry.pairs import Camera
 from ..tables.cameras import Cameras
 from ..tables.fields import TableError
-from ..tables.measured import COORDINATES, COVARIANCES, DEVIATIONS, Table
+from ..tables.measured import COORDINATES, COVARIANCES, DEVIATIONS, SCORE, Table
 
 EQUAL = 1e-12
 """Relative difference of variances that is rounding."""
@@ -70,7 +70,8 @@ class Seen(NamedTuple):
 
 class Match(NamedTuple):
     """One pair: the names of it and of its photos, the names of its points, where they
-    are seen, and both focal lengths in pixels."""
+    are seen, both focal lengths in pixels, and the scores of its points where there are
+    any."""
 
     name: str
     photos: tuple[str, str]
@@ -78,6 +79,7 @@ class Match(NamedTuple):
     left: Seen
     right: Seen
     focals: tuple[float, float]
+    score: Float[np.ndarray, " point"] | None = None
 
 
 class Matches(NamedTuple):
@@ -120,6 +122,8 @@ class Matches(NamedTuple):
             numbers |= _accuracy(pairs.sigma, pairs.roots)
         elif self.sigma_known:
             numbers["sigma"] = pairs.sigma
+        if pairs.score is not None:
+            numbers[SCORE] = pairs.score
         return Table(
             file=self.file,
             names=np.array(self.names, object),
@@ -176,6 +180,7 @@ def collect(
         focal_left=focal_left,
         focal_right=focal_right,
         roots=roots,
+        score=_join_scores(matches),
     )
     return Matches(
         file=file,
@@ -187,6 +192,16 @@ def collect(
         sigma_known=sigma is not None,
         warnings=tuple(warnings),
     )
+
+
+def _join_scores(matches: Sequence[Match]) -> Float[np.ndarray, " row"] | None:
+    """The scores of all points, NaN of pairs without; None where no pair has any."""
+    if all(m.score is None for m in matches):
+        return None
+    each = [
+        np.full(len(m.points), np.nan) if m.score is None else m.score for m in matches
+    ]
+    return np.concatenate(each)
 
 
 def check_names(file: str, names: Sequence[str]) -> None:

@@ -33,7 +33,8 @@ def pair_from_opencv(
     scale, so that large patches are less accurate; the two keypoints of a match then
     have standard deviations of their own, and the pair has covariances. What the part
     is depends on the detector: with a guess sigma0 of the orientation says by what it
-    is wrong. With neither all pixels have equal weight. Other parameters are those of
+    is wrong. With neither all pixels have equal weight. The score of a match is minus its
+    `DMatch.distance`, where all matches have one. Other parameters are those of
     `pair_from_pixels`.
 
     Raises ValueError for no matches, for those of `knnMatch` that were not chosen from,
@@ -61,6 +62,7 @@ def pair_from_opencv(
         K_left,
         K_right,
         sigma=deviations,
+        score=_scores(matches),
         distortion_left=distortion_left,
         distortion_right=distortion_right,
     )
@@ -75,6 +77,14 @@ def _chosen(keypoints: Sequence[Any], indices: list[int], side: str) -> list[Any
                 f"photo, which has {len(keypoints)}; are the photos exchanged?"
             )
     return [keypoints[index] for index in indices]
+
+
+def _scores(matches: list[Any]) -> Float[np.ndarray, " match"] | None:
+    """How likely the matches are right: the less, the farther apart their descriptors
+    are. None where nobody says, or all say the same."""
+    distances = np.array([getattr(m, "distance", np.nan) for m in matches], float)
+    told = np.all(np.isfinite(distances)) and np.ptp(distances) > 0
+    return -distances if told else None
 
 
 def _sizes(left: list[Any], right: list[Any]) -> Float[np.ndarray, "match 2"]:

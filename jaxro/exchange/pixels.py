@@ -53,6 +53,7 @@ def pair_from_pixels(
     sigma: Values | None = None,
     covariances: tuple[Values, Values] | None = None,
     mask: Values | None = None,
+    score: Values | None = None,
     distortion_left: lens.Coefficients | None = None,
     distortion_right: lens.Coefficients | None = None,
 ) -> Pair:
@@ -61,6 +62,7 @@ def pair_from_pixels(
     `K_left`, `K_right`: the camera matrices; without the right one both photos have the
     same camera. `sigma`: the standard deviation of a pixel coordinate, one for all
     points, one for each (point,), or of the left and of the right point (point, 2).
+    `score` of each match: that of a `Pair`.
     `covariances` in its place: the covariance matrices of (column, row), left and
     right, (point, 2, 2) each. With neither all pixels have equal weight, and sigma0 is
     in pixels. `distortion_left`, `distortion_right`: OpenCV's (k1, k2, p1, p2[, k3]).
@@ -88,7 +90,10 @@ def pair_from_pixels(
             f"pair_from_pixels: {len(left.x)} left and {len(right.x)} right points; "
             "both are wanted in the order of the matches"
         )
-    return pair_of_points(left, right, sigma=sigma, covariances=covariances, mask=mask)
+    of_points = {"mask": mask, "score": score}
+    return pair_of_points(
+        left, right, sigma=sigma, covariances=covariances, **of_points
+    )
 
 
 def pair_of_points(
@@ -98,6 +103,7 @@ def pair_of_points(
     sigma: Values | None,
     covariances: tuple[Values, Values] | None = None,
     mask: Values | None = None,
+    score: Values | None = None,
 ) -> Pair:
     """The pair of these points, with what is said of the accuracy of their pixels."""
     coordinates, focal = (left.x, left.y, right.x, right.y), (left.focal, right.focal)
@@ -105,10 +111,11 @@ def pair_of_points(
         raise ValueError("pair_from_pixels: sigma and covariances are given; one is")
     one_sigma = covariances is None and np.ndim(0.0 if sigma is None else sigma) < 2
     if one_sigma and left.plain and right.plain:
-        return pair(*coordinates, focal=focal, sigma=sigma, mask=mask)
+        return pair(*coordinates, focal=focal, sigma=sigma, mask=mask, score=score)
     pixels = _covariances(sigma, covariances, len(left.x))
     of_photos = left.covariances(pixels[0]), right.covariances(pixels[1])
-    return pair(*coordinates, focal=focal, covariances=of_photos, mask=mask)
+    accuracy = {"covariances": of_photos, "mask": mask}
+    return pair(*coordinates, focal=focal, score=score, **accuracy)
 
 
 def _covariances(

@@ -90,6 +90,9 @@ class Pair(eqx.Module):
 
     `roots`: where the coordinates of a point are not equally accurate, or depend on
     each other. sigma² then is the mean of their variances. None for all other pairs.
+    `score`: how likely each match is right for whoever matched the photos, the higher the
+    likelier, in any unit; only its order counts. NaN where it is not known; None of pairs
+    without scores.
     """
 
     x_left: Float[Array, "*pairs point"]
@@ -101,6 +104,7 @@ class Pair(eqx.Module):
     focal_left: Float[Array, "*pairs"]
     focal_right: Float[Array, "*pairs"]
     roots: CofactorRoots | None = None
+    score: Float[Array, "*pairs point"] | None = None
 
     @property
     def coordinates(self) -> Coordinates:
@@ -161,6 +165,7 @@ def pair(
     weight: Values | None = None,
     mask: Values | None = None,
     covariances: tuple[Values, Values] | None = None,
+    score: Values | None = None,
     copies: bool = False,
 ) -> Pair:
     """A `Pair` from four equally long coordinate arrays (leading batch axes allowed).
@@ -169,10 +174,11 @@ def pair(
     coordinate, per point or for all (default 1). `weight`: relative weights, sigma /
     sqrt(weight); weight 0 leaves the point out. `covariances`, in place of sigma: the
     covariance matrices of (x, y) in the left photo and in the right one, (..., point,
-    2, 2) each or one for all. A point that repeats another one (`geometry.copies`) is
-    masked: the two are one measurement. With `copies` it takes part, as in a layout
-    that is only planned. Raises ValueError where the shapes do not agree, and for what
-    are no real numbers.
+    2, 2) each or one for all. `score` of each match: the higher the likelier it is right;
+    searches for wrong points use it (`rejection.search`). A point that repeats another
+    one (`geometry.copies`) is masked: the two are one measurement. With `copies` it
+    takes part, as in a layout that is only planned. Raises ValueError where the shapes
+    do not agree, and for what are no real numbers.
     """
     dtype = jnp.result_type(float)
     if covariances is not None and sigma is not None:
@@ -186,7 +192,7 @@ def pair(
             "of them"
         )
     left, right = focal if isinstance(focal, tuple | list) else (focal, focal)
-    given = x_left, y_left, x_right, y_right, left, right, sigma, weight, mask
+    given = x_left, y_left, x_right, y_right, left, right, sigma, weight, mask, score
     names = (
         "x_left",
         "y_left",
@@ -197,6 +203,7 @@ def pair(
         "sigma",
         "weight",
         "mask",
+        "score",
     )
     for name, values in zip(names, given, strict=True):
         if isinstance(values, np.ma.MaskedArray):
@@ -239,9 +246,11 @@ def pair(
         focals = [
             xp.broadcast_to(xp.array(f, dtype), shape[:-1]) for f in (left, right)
         ]
+        if score is not None:
+            score = xp.broadcast_to(xp.array(score, dtype), shape)
     except ValueError as error:
         fit = (
-            f"mask, sigma and weight must fit the coordinates' shape {shape}, focal "
+            f"mask, sigma, weight and score must fit the coordinates' shape {shape}, focal "
             f"lengths {shape[:-1]}"
         )
         raise ValueError(f"pair: {fit}: {error}") from None
@@ -249,9 +258,7 @@ def pair(
         smaller = xp.minimum(*focals)
         first = find_copies(coordinates, deviation, taking_part, smaller, xp)
         taking_part = taking_part & ~repeated(first)
-    return _as_pair(
-        [*coordinates, deviation, taking_part, *focals, *jax.tree.leaves(roots)]
-    )
+    return _as_pair([*coordinates, deviation, taking_part, *focals], roots, score)
 
 
 def with_roots(one: Pair) -> Pair:
@@ -264,18 +271,26 @@ def with_roots(one: Pair) -> Pair:
     return eqx.tree_at(lambda pair: pair.roots, one, roots, is_leaf=none)
 
 
+def with_score(one: Pair) -> Pair:
+    """The pair with a score of each match: if it has none, one that is not known."""
+    if one.score is not None:
+        return one
+    none, xp = lambda leaf: leaf is None, _library(one)
+    unknown = xp.full(one.x_left.shape, np.nan, one.x_left.dtype)
+    return eqx.tree_at(lambda pair: pair.score, one, unknown, is_leaf=none)
+
+
 def _library(values: PyTree) -> ModuleType:
     """NumPy, which compiles nothing for each new length; of what is being traced,
     JAX's."""
     return jnp if is_traced(values) else np
 
 
-def _as_pair(fields: list) -> Pair:
+def _as_pair(fields: list, roots: CofactorRoots | None, score: Any) -> Pair:
     """A `Pair` of these arrays, which nobody else changes: their memory is not
-    copied. Behind the eight of every pair stand those of `roots`, where there are
-    any."""
-    fields = fields if is_traced(fields) else jax.device_put(fields)
-    return Pair(*fields[:8], CofactorRoots(*fields[8:]) if fields[8:] else None)
+    copied."""
+    every = [*fields, roots, score]
+    return Pair(*(every if is_traced(every) else jax.device_put(every)))
 
 
 def double(one: PyTree) -> PyTree:
@@ -301,7 +316,7 @@ def double(one: PyTree) -> PyTree:
 def pad(one: Pair, points: int) -> Pair:
     """The pair with zeros up to `points` places, masked out. Raises ValueError if it
     has more."""
-    return _as_pair(_pad_fields(one, points, _library(one)))
+    return _as_pair(*_pad_fields(one, points, _library(one)))
 
 
 def quickly(pair: Pair, *_: Any, **__: Any) -> dict[str, Any]:
@@ -322,8 +337,9 @@ def first_points(tree: PyTree, points: int) -> PyTree:
     return jax.device_put(jax.tree.map(lambda a: np.asarray(a)[..., :points], tree))
 
 
-def _pad_fields(one: Pair, points: int, xp: ModuleType) -> list:
-    """New fields of a `Pair`, with so many places."""
+def _pad_fields(one: Pair, points: int, xp: ModuleType) -> tuple[list, Any, Any]:
+    """New fields of a `Pair`, with so many places: those of every pair, the roots and
+    the score."""
     missing = points - one.x_left.shape[-1]
     if missing < 0:
         raise ValueError(
@@ -334,15 +350,18 @@ def _pad_fields(one: Pair, points: int, xp: ModuleType) -> list:
         [field, xp.full(shape, fill, field.dtype)], axis=-1
     )
     *coordinates, sigma, mask, left, right = jax.tree.leaves(one)[:8]
-    roots = () if one.roots is None else zip(one.roots, UNIT, strict=True)
-    return [
+    roots = one.roots
+    if roots is not None:
+        fill = zip(roots, UNIT, strict=True)
+        roots = CofactorRoots(*(places(root, unit) for root, unit in fill))
+    fields = [
         *map(places, coordinates),
         places(sigma, 1),
         places(mask),
         xp.array(left),
         xp.array(right),
-        *(places(root, fill) for root, fill in roots),
     ]
+    return fields, roots, None if one.score is None else places(one.score, np.nan)
 
 
 def stack(pairs: Sequence[Pair], points: int | None = None) -> Pair:
@@ -358,10 +377,12 @@ def stack(pairs: Sequence[Pair], points: int | None = None) -> Pair:
         )
     if any(one.roots is not None for one in pairs):
         pairs = [with_roots(one) for one in pairs]
+    if any(one.score is not None for one in pairs):
+        pairs = [with_score(one) for one in pairs]
     longest = max(one.x_left.shape[-1] for one in pairs) if points is None else points
     xp = _library(pairs)
     rows = [_pad_fields(one, longest, xp) for one in pairs]
-    return _as_pair([xp.stack(fields) for fields in zip(*rows, strict=True)])
+    return _as_pair(*jax.tree.map(lambda *fields: xp.stack(fields), *rows))
 
 
 def unstack(batch: Pair) -> list[Pair]:
@@ -373,10 +394,9 @@ def unstack(batch: Pair) -> list[Pair]:
         )
     if not is_traced(batch):
         batch = jax.tree.map(np.array, batch)  # what is made of it keeps its memory
-    fields = jax.tree.leaves(batch)
-    return [
-        _as_pair([field[i] for field in fields]) for i in range(batch.x_left.shape[0])
-    ]
+    every = range(batch.x_left.shape[0])
+    rows = [jax.tree.map(lambda a, i=i: a[i], batch) for i in every]
+    return [row if is_traced(row) else jax.device_put(row) for row in rows]
 
 
 def swapped(one: Pair) -> Pair:
@@ -391,6 +411,7 @@ def swapped(one: Pair) -> Pair:
         focal_left=one.focal_right,
         focal_right=one.focal_left,
         roots=None if one.roots is None else one.roots.swapped(),
+        score=one.score,
     )
 
 
@@ -433,5 +454,6 @@ def mask_unusable(one: Pair) -> tuple[Pair, Bool[Array, "*pairs"]]:
         use,
         *(jnp.where(ok, f, 1.0) for ok, f in zip(focal_ok, focals, strict=True)),
         roots,
+        one.score,
     )
     return repaired, bad

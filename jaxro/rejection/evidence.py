@@ -169,6 +169,25 @@ def log_least_accidents(
     return jnp.min(jax.vmap(within)(parts))
 
 
+def z_of_scores(score: Values, use: Use, others: Use) -> Float[Array, ""]:
+    """By how many standard deviations the ranks of the scores of points in use are
+    higher than if they had been drawn from all, these and the others (Mann and Whitney
+    1947); of points without a score nothing is said."""
+    known = jnp.isfinite(score)
+    use, others = use & known, others & known
+    value = jnp.where(use | others, score, jnp.inf)
+    in_order = jnp.sort(value)
+    below, up_to = (
+        jnp.searchsorted(in_order, value, side=side).astype(score.dtype)
+        for side in ("left", "right")
+    )
+    k, m = count(use), count(others)
+    rank = (below + up_to + 1) / 2
+    above = sum_of(rank, use) - k * (k + m + 1) / 2
+    variance = k * m * (k + m + 1) / 12
+    return above / jnp.sqrt(jnp.maximum(variance, 1.0))
+
+
 def fewest_points(
     chance: Float[Array, ""], of: Float[Array, ""], most: Float[Array, ""], size: int
 ) -> Float[Array, ""]:

@@ -16,9 +16,10 @@ a larger share p of the points, would have been met with the probability `confid
 after k subsets with 1 - (1 - p⁵ / LUCK)^k >= confidence.
 
 Of many points every second block from the third on draws from the points whose
-neighbours agree best (`neighbours`), whose order is computed then. This changes only
-the order in which orientations are met: the cost does not depend on it, and these
-blocks do not count for the confidence.
+neighbours agree best (`neighbours`), whose order is computed then; or, of matches that
+have scores, from those of the highest scores (Chum and Matas 2005), of few points as
+well. This changes only the order in which orientations are met: the cost does not depend
+on it, and these blocks do not count for the confidence.
 """
 
 import math
@@ -75,8 +76,8 @@ with the best of its block."""
 
 
 Order = Int[Array, "point"] | None
-"""The places of the points, those first whose neighbours agree best; None where
-neighbours are not asked."""
+"""The places of the points, those first whose neighbours agree best or whose scores are
+highest; None where neither is asked."""
 
 
 class Found(NamedTuple):
@@ -112,26 +113,34 @@ def nothing_found(pose: RelativePose) -> Found:
 
 
 class Sample(NamedTuple):
-    """The points of a pair for a search: coordinates, sigma and roots of those that
-    take part, before all others, and how many they are."""
+    """The points of a pair for a search: coordinates, sigma, roots and scores of those
+    that take part, before all others, and how many they are."""
 
     rows: Float[Array, "point 4"]
     sigma: Float[Array, "point"]
     of: Float[Array, ""]
     roots: CofactorRoots | None
+    score: Float[Array, "point"] | None
 
     @property
-    def has_neighbours(self) -> bool:
-        """Whether there are points enough that neighbours may say something."""
-        return len(self.rows) >= ENOUGH
+    def has_order(self) -> bool:
+        """Whether there are scores, or points enough that neighbours may say
+        something."""
+        return self.score is not None or len(self.rows) >= ENOUGH
 
     def update_order(
         self, order: Int[Array, "point"], needed: Bool[Array, ""]
     ) -> Int[Array, "point"]:
-        """The order by neighbours where it is needed, else the one there is."""
-        rank = lambda needed: order_by_neighbours(
-            self.rows, jnp.where(needed, self.of, 0.0)
-        )
+        """The order by scores or neighbours where it is needed, else the one there
+        is."""
+
+        def rank(needed: Bool[Array, ""]) -> Int[Array, "point"]:
+            if self.score is None:
+                return order_by_neighbours(self.rows, jnp.where(needed, self.of, 0.0))
+            there = jnp.arange(len(self.score), dtype=self.of.dtype) < self.of
+            known = there & jnp.isfinite(self.score)
+            return jnp.argsort(jnp.where(known, -self.score, jnp.inf))
+
         return if_needed(needed, rank, order)
 
 
@@ -167,7 +176,7 @@ class Search(eqx.Module):
         `worth` have been solved."""
         most = -(-self.count // self.block)
         sample = _sample(pair)
-        guided = sample.has_neighbours and most > FIRST_GUIDED
+        guided = sample.has_order and most > FIRST_GUIDED
 
         def more(state: tuple[Found, Order]) -> Bool[Array, ""]:
             found, _ = state
@@ -307,6 +316,7 @@ def _sample(pair: Pair) -> Sample:
         sigma=move_up(pair, pair.sigma, fill=1.0),
         of=count(pair.mask),
         roots=jax.tree.map(lambda a: move_up(pair, a, fill=1.0), pair.roots),
+        score=jax.tree.map(lambda a: move_up(pair, a, fill=jnp.nan), pair.score),
     )
 
 

@@ -58,6 +58,11 @@ MAJORITY = 0.4
 """Part of the points that agreed before that the noise has to come from: a few points
 may agree by accident."""
 
+SCORED = 4.0
+"""Standard deviations by which the scores of the points kept are higher than those of the
+others, from which they are evidence: a structure that repeats itself has none of it, as a
+match with one window is no better than with the next."""
+
 SURE = 30.0
 """Redundancy of the noise found from which it may contradict the sigma stated: of fewer
 points some fit by accident."""
@@ -87,7 +92,8 @@ class Thorough(AbstractStage):
     `accidents_at_once`. Else it is believed if the subsets were enough to have met a
     set of `better` times as many points, and sets as good are not expected by accident
     more than `accidents` times (for many points more seldom), one witness
-    of each place (`evidence.apart`). The chance of agreement is measured on this scene:
+    of each place (`evidence.apart`), or all points where their scores are higher than those
+    of the others by SCORED standard deviations. The chance of agreement is measured on this scene:
     by partners shifted among the points, and by the orientations that lost. Of a plane with other
     points beside it both poses are compared. The search ends when no set that it could
     still find would be believed, after at least `least` subsets, so that the pose is as
@@ -148,6 +154,9 @@ class Thorough(AbstractStage):
         sets = jnp.stack([evidence.apart(own), own.mask])
         certain, by_points = lax.map(judge, sets)
         believed = at_once | certain
+        if own.score is not None:
+            z = evidence.z_of_scores(own.score, use, own.mask & ~use)
+            believed = believed | (by_points & (z >= SCORED))
         decision = Decision(pose=pose, use=use, believed=believed, scale=scale)
         first = sought.number == 0
         alike = by_points & ~believed

@@ -30,6 +30,9 @@ DEVIATIONS = tuple(f"sigma_{name}" for name in COORDINATES)
 COVARIANCES = ("cov_xy_left", "cov_xy_right")
 """Columns with the covariances of x and y of a photo, beside the deviations."""
 
+SCORE = "score"
+"""Column that tells how likely a match is right, the higher the likelier."""
+
 VERDICTS = {0: "rejected", 1: "kept", 2: "undecided"}
 """What a procedure may have decided about a point."""
 
@@ -41,12 +44,12 @@ NAMED = 5
 
 COLUMNS = Columns(
     ("point", *COORDINATES),
-    ("pair", *PHOTOS, "sigma", *DEVIATIONS, *COVARIANCES),
+    ("pair", *PHOTOS, "sigma", *DEVIATIONS, *COVARIANCES, SCORE),
     {"id": "point", "xl": "x_left", "yl": "y_left", "xr": "x_right", "yr": "y_right"},
     texts=("pair", "point", *PHOTOS),
     results=OF_CLEANING,
 )
-NUMBERS = (*COORDINATES, "sigma", *DEVIATIONS, *COVARIANCES)
+NUMBERS = (*COORDINATES, "sigma", *DEVIATIONS, *COVARIANCES, SCORE)
 
 CameraPairs = tuple[Camera, Camera] | list[tuple[Camera, Camera]]
 """(left, right) of all pairs, or of each."""
@@ -138,7 +141,8 @@ class Table:
         squares = [to_floats(self.numbers[name]) ** 2 for name in DEVIATIONS]
         sigma = np.sqrt(np.mean(squares, axis=0))
         most = float(np.nanmax(np.sqrt(np.max(squares, axis=0)) / sigma))
-        others = {n: c for n, c in self.numbers.items() if n in COORDINATES}
+        kept = (*COORDINATES, SCORE)
+        others = {n: c for n, c in self.numbers.items() if n in kept}
         warning = (
             f"{self.file}: each point is used with one standard deviation, the mean of "
             f"its coordinates; that of a single coordinate is up to {most:.3g} times it."
@@ -287,6 +291,7 @@ def to_ragged(table: Table, cameras: CameraPairs, sigma: float | None = None) ->
         focal_left=focal_left,
         focal_right=focal_right,
         roots=roots,
+        score=to_floats(table.numbers[SCORE]) if SCORE in table.numbers else None,
     )
     return without_copies(ragged)
 
@@ -354,9 +359,10 @@ def check_accuracy(columns: Sequence[str], file: str, line: int | None = None) -
 def one_pair(pairs: Ragged, number: int) -> Pair:
     """A pair of `pairs`, not padded, as JAX arrays."""
     rows = slice(int(pairs.begins[number]), int(pairs.begins[number + 1]))
-    of_points, roots = jax.tree.map(lambda a: a[rows], (pairs[1:7], pairs.roots))
+    own = pairs[1:7], (pairs.roots, pairs.score)
+    of_points, of_some = jax.tree.map(lambda a: a[rows], own)
     focals = pairs.focal_left[number], pairs.focal_right[number]
-    return Pair(*jax.device_put([*of_points, *focals, roots]))
+    return Pair(*jax.device_put([*of_points, *focals, *of_some]))
 
 
 def to_floats(column: Any) -> Float[np.ndarray, " row"]:

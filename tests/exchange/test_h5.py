@@ -141,6 +141,21 @@ def test_matrices_in_place_of_models(path):
         np.testing.assert_array_equal(a, b)
 
 
+def test_scores_are_those_of_their_matches(path):
+    """Under either name; unknown of a pair without, and in the table of the commands."""
+    with h5py.File(path, "w") as file:
+        put(file, "a")["scores"] = np.arange(40.0)
+        put(file, "b")["matching_scores0"] = -np.arange(25.0)
+        put(file, "c", count=30)
+        del file["b"]["x1"], file["b"]["x2"]
+        file["b"]["x1"], file["b"]["x2"] = seen(0, PINHOLE, 25), seen(1, SIMPLE, 25)
+    found = exchange.read_h5(path)
+    unknown = np.full(30, np.nan)
+    wanted = np.concatenate([np.arange(40.0), -np.arange(25.0), unknown])
+    np.testing.assert_array_equal(found.pairs.score, wanted)
+    np.testing.assert_array_equal(found.table.numbers["score"], wanted)
+
+
 def broken(change):
     def write(file):
         group = put(file, "a")
@@ -164,6 +179,10 @@ def replaced(name, value):
         (lambda file: None, "found no groups"),
         (replaced("x2", None), "column a/x2: found no such entry, but R, camera1"),
         (replaced("x2", np.zeros((3, 2))), "3 points beside 40 in x1"),
+        (
+            broken(lambda group: group.create_dataset("scores", data=[1.0])),
+            "column a/scores: found shape (1,)",
+        ),
         (replaced("x1", np.zeros((40, 3))), "column a/x1: found shape (40, 3)"),
         (replaced("camera1/params", [1.0]), "column a/camera1/params: found 1 numbers"),
         (

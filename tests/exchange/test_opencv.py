@@ -35,7 +35,7 @@ def measured():
 
 def test_matches_name_their_keypoints(measured):
     pair = exchange.pair_from_opencv(*measured, scene.K_LEFT, scene.K_RIGHT, sigma=0.5)
-    assert pair.x_left.shape == (20,)
+    assert pair.x_left.shape == (20,) and pair.score is None
     assert max(scene.errors(jaxro.orient(pair))) < 1e-9
 
 
@@ -46,12 +46,14 @@ def test_objects_of_opencv_itself(measured):
     pair = exchange.pair_from_opencv(
         tuple(map(own, left)),
         tuple(map(own, right)),
-        [cv2.DMatch(m.queryIdx, m.trainIdx, 0.5) for m in matches],
+        [cv2.DMatch(m.queryIdx, m.trainIdx, 0.5 + k) for k, m in enumerate(matches)],
         scene.K_LEFT,
         scene.K_RIGHT,
     )
     # OpenCV keeps places in single precision
     assert max(scene.errors(jaxro.orient(pair))) < 1e-5
+    # the less the farther apart
+    np.testing.assert_array_equal(pair.score, -0.5 - np.arange(20))
 
 
 def test_deviations_by_size_are_those_of_each_photo(measured):
