@@ -12,6 +12,7 @@ import jaxro
 from jaxro.batches.ragged import concatenate, join
 from jaxro.geometry.elements import vertical
 from jaxro.geometry.pairs import mask_unusable, pad, stack, swapped, unstack
+from jaxro.rejection import Recommended
 from jaxro.rejection.evidence import z_of_scores
 from jaxro.rejection.search import Search, nothing_found
 from jaxro.tables import csv
@@ -113,3 +114,17 @@ def test_the_search_begins_with_the_highest_scores():
     high = np.asarray(met(pair(1.0 * found.good)))
     low = np.asarray(met(pair(-1.0 * found.good)))
     assert np.sum(high < low - 10) >= 3 and not np.any(low < high - 10)
+
+
+@pytest.mark.slow
+def test_pairs_with_scores_are_cleaned():
+    """Scores that tell right from wrong lose no pair, and reject nothing themselves."""
+    found = scenes.photographs(4, POINTS, 0.6, "sideways", seed=6)
+    sigma = np.broadcast_to(found.sigma[:, None], found.good.shape)
+    pairs = jaxro.pair(
+        *found.coordinates, focal=found.focal, sigma=sigma, score=1.0 * found.good
+    )
+    read = lambda r: (r.orientation.usable, r.mask)
+    usable, mask = jaxro.clean_batch(pairs, Recommended(), select=read)
+    assert np.all(usable)
+    assert np.mean(np.asarray(mask)[found.good]) > 0.9
