@@ -17,6 +17,7 @@ Everything random takes a JAX key. `random_pairs` makes photos in any position f
 of the general start.
 """
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -163,8 +164,8 @@ def plant(
         c + jnp.where(one.mask, jnp.asarray(e, float), 0.0)
         for c, e in zip(one.coordinates, errors, strict=True)
     ]
-    fields = one.sigma, one.mask, one.focal_left, one.focal_right, one.roots
-    return Pair(*moved, *fields)
+    names = ("x_left", "y_left", "x_right", "y_right")
+    return dataclasses.replace(one, **dict(zip(names, moved, strict=True)))
 
 
 def noisy(one: Pair, key: PRNGKeyArray, sigma: ArrayLike) -> Pair:
