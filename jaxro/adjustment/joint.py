@@ -1,7 +1,8 @@
 """The adjustment of several kinds of conditions between blocks of parameters, all at
 once."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -168,7 +169,7 @@ def check_families(
     terms: tuple[Term, ...],
     start: Families,
     eliminate: str | None,
-    held: dict[str, ArrayLike] | None,
+    held: Mapping[str, ArrayLike] | None,
 ) -> None:
     """Raises ValueError for terms and families that do not go together."""
     if unknown := set(held or {}) - set(start):
@@ -185,7 +186,7 @@ def check_families(
     elimination.layout(start, terms, eliminate)
 
 
-def held_of(layout: Layout, held: dict[str, ArrayLike]) -> Held:
+def held_of(layout: Layout, held: Mapping[str, ArrayLike]) -> Held:
     """For every local parameter whether it is held; of a family one flag for all, one
     for each member, or one for each number of each member."""
 
@@ -204,7 +205,7 @@ def adjust_jointly(
     *,
     eliminate: str | None = None,
     constraints: Callable | None = None,
-    held: dict[str, ArrayLike] | None = None,
+    held: Mapping[str, ArrayLike] | None = None,
     loss: AbstractLoss | None = None,
     solver: optx.AbstractLeastSquaresSolver | None = None,
     max_steps: int = 30,
@@ -257,7 +258,7 @@ def _read(
         ]
     )
     known = 0 if joint.constraints is None else joint._constraint(steps)[1].shape[0]  # pyright: ignore[reportOptionalSubscript]
-    unknown = layout.total - known
+    unknown: Any = layout.total - known
     if joint.held is not None:
         unknown = unknown - sum(jnp.sum(fixed) for fixed in joint.held.values())
     freedom = jnp.sum(use) - unknown
@@ -268,6 +269,8 @@ def _read(
             jnp.sum(rows**2) / jnp.where(checked, freedom, 1).astype(rows.dtype)
         )
     else:
+        if joint.held is not None:
+            unknown = unknown.astype(rows.dtype)
         sigma0, factor = spread(loss, rows, use.astype(rows.dtype), unknown)
         factor = jnp.where(checked, factor, 1.0)
         plain = joint.solve(steps, parts, None)

@@ -10,7 +10,7 @@ that are not linear in l are satisfied to first order in v (the second order is 
 the radius of curvature).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -67,7 +67,7 @@ def adjust(
     *,
     eliminate: str | None = None,
     constraints: Callable | None = None,
-    held: dict[str, ArrayLike] | None = None,
+    held: Mapping[str, ArrayLike] | None = None,
     loss: AbstractLoss | None = None,
     solver: optx.AbstractLeastSquaresSolver | None = None,
     max_steps: int = 30,

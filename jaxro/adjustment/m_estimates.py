@@ -70,10 +70,13 @@ class Spread(NamedTuple):
 
 
 def spread(
-    loss: AbstractLoss, r: Float[Array, " entry"], use: Float[Array, " entry"], p: int
+    loss: AbstractLoss,
+    r: Float[Array, " entry"],
+    use: Float[Array, " entry"],
+    p: int | Float[Array, ""],
 ) -> Spread:
-    """`Spread` of residuals r whitened without the loss; `use` is 1 for those that
-    count and 0 for others.
+    """`Spread` of residuals r whitened without the loss, by p parameters; `use` is 1 for
+    those that count and 0 for others.
 
     Both numbers are finite, but mean nothing, without redundancy.
     """

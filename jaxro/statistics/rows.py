@@ -1,7 +1,7 @@
 """The rows of a solution: the whitened residuals of all its conditions and their
 derivatives by all parameters. All statistics of residuals start from these numbers."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ def rows(
     terms: Term | Sequence[Term],
     parameters: Families,
     *,
-    held: dict[str, ArrayLike] | None = None,
+    held: Mapping[str, ArrayLike] | None = None,
 ) -> Rows:
     """The rows of terms at the parameters of a solution by `adjust`, in the order of
     their families."""
@@ -64,7 +64,7 @@ def _linearise(
     terms: tuple[Term, ...],
     families: Families,
     *,
-    held: dict[str, ArrayLike] | None,
+    held: Mapping[str, ArrayLike] | None,
 ) -> list[Linearised]:
     """The terms linearised where the families are."""
     blocks = layout(families, terms, None)
@@ -72,7 +72,7 @@ def _linearise(
     origin: Steps = {
         block.name: jnp.zeros((block.members, block.size)) for block in blocks.blocks
     }
-    return Joint(terms, families, blocks, None, None, fixed).linearise(origin)
+    return Joint(terms, dict(families), blocks, None, None, fixed).linearise(origin)
 
 
 def normalise_rows(given: Rows) -> Normalised:

@@ -137,6 +137,9 @@ def test_what_is_held_is_known(eliminate, solver):
     assert found.degrees_of_freedom == len(apart) - np.sum(free)
     misfit = np.asarray(found.residuals[0][:, 0])
     np.testing.assert_allclose(design[:, free].T @ misfit, 0, atol=1e-6)
+    if eliminate is solver is None:
+        mild = adjust(term, start, held=held, loss=losses.Huber(1e3))
+        np.testing.assert_allclose(mild.sigma0, found.sigma0, rtol=1e-6)
 
 
 def test_a_net_without_a_known_height_needs_a_constraint(net):
