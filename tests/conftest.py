@@ -29,6 +29,12 @@ os.environ["XLA_FLAGS"] = " ".join(
 # next run; given a size, JAX locks the folder to write, and gives back what is old
 caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(caches / "jaxro-tests"))
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    # a run that was killed may have left a program without the time of its use, which
+    # JAX never reads again, and warns of
+    for kept in Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).glob("*-cache"):
+        if not kept.with_name(kept.name.removesuffix("cache") + "atime").exists():
+            kept.unlink()
 os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(1 << 32)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
