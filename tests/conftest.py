@@ -14,7 +14,6 @@ from jaxtyping import install_import_hook
 # submodules
 install_import_hook("jaxro", "beartype.beartype")
 
-os.environ["JAXRO_CACHE"] = ""  # no test finds what another one left
 os.environ["JAXRO_QUIET"] = "1"
 # most of the time goes into compiling programs that run once
 cheap = ["backend_optimization_level=0", "cpu_parallel_codegen_split_count=1"]
@@ -29,6 +28,9 @@ os.environ["XLA_FLAGS"] = " ".join(
 # next run; given a size, JAX locks the folder to write, and gives back what is old
 caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(caches / "jaxro-tests"))
+# whole programs, which nobody has to trace again, are kept beside them until a line of
+# the package changes
+os.environ["JAXRO_CACHE"] = os.environ["JAX_COMPILATION_CACHE_DIR"] + "/programs"
 if "PYTEST_XDIST_WORKER" not in os.environ:
     # a run that was killed may have left a program without the time of its use, which
     # JAX never reads again, and warns of
@@ -43,7 +45,7 @@ from examples import example  # noqa: E402, F401 (a fixture of all tests)
 from jax.experimental.compilation_cache import compilation_cache  # noqa: E402
 from program_budget import Budget  # noqa: E402
 
-from jaxro.xla import programs, settings  # noqa: E402
+from jaxro.xla import programs, settings, store  # noqa: E402
 
 # what JAX keeps of the programs would be looked through at every collection: a
 # sixteenth of the time
@@ -83,17 +85,19 @@ def memory():
 
 @pytest.fixture
 def unkept():
-    """Every program is compiled: none is left in memory or in JAX's own cache."""
+    """Every program is compiled: none is left in memory, on disk or in JAX's own
+    cache."""
     folder = jax.config.jax_compilation_cache_dir
 
-    def use(folder: str | None) -> None:
+    def use(folder: str | None, programs_in: Path | None) -> None:
         jax.config.update("jax_compilation_cache_dir", folder)
         compilation_cache.reset_cache()
+        store.use(programs_in)
         programs.forget()
 
-    use(None)
+    use(None, None)
     yield
-    use(folder)
+    use(folder, store.default_folder())
 
 
 def pytest_configure(config: pytest.Config) -> None:

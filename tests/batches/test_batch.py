@@ -161,17 +161,14 @@ def _sigma0(orientation):
 
 
 @pytest.mark.slow
-def test_programs_of_functions_without_a_name_are_told_apart(near, tmp_path):
+def test_programs_of_functions_without_a_name_are_told_apart(near, tmp_path, unkept):
     """A kept program of a lambda is known by what it computes."""
     few = jax.tree.map(lambda a: a[:7], near)
     reads = lambda o: o.sigma0, lambda o: o.m_q, lambda o: o.sigma0
     store.use(tmp_path)
-    try:
-        first, other, again = (
-            jaxro.orient_batch(few, select=read, chunk=3) for read in reads
-        )
-    finally:
-        store.use(None)
+    first, other, again = (
+        jaxro.orient_batch(few, select=read, chunk=3) for read in reads
+    )
     np.testing.assert_array_equal(again, first)
     whole = jaxro.orient_batch(few, chunk=3)
     np.testing.assert_allclose(first, whole.sigma0, rtol=1e-10)

@@ -2,6 +2,7 @@
 the thread that calls them, as users have them: not kept on disk, as those of the other
 tests are."""
 
+import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -292,5 +293,6 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 import jaxro
 jaxro.orient(jaxro.pair(*4 * [[1.0, -2.0, 5.0, -6.0, 3.0, 8.0]], focal=100.0))
 """
-    subprocess.run([sys.executable, "-c", code], check=True)
+    unkept = os.environ | {"JAXRO_CACHE": ""}
+    subprocess.run([sys.executable, "-c", code], check=True, env=unkept)
     assert any("orient_near" in file.name for file in tmp_path.iterdir())

@@ -27,9 +27,7 @@ def folder(tmp_path, unkept):
     kept = tmp_path / "programs"
     store.use(kept)
     run()
-    yield kept
-    store.use(None)
-    programs.forget()
+    return kept
 
 
 def run() -> None:
@@ -157,7 +155,7 @@ def test_a_stored_program_that_does_not_run_is_compiled_anew(folder, monkeypatch
 
 
 @pytest.mark.parametrize("mode", [0o775, 0o777, 0o2777])
-def test_a_folder_that_others_may_write_to_is_not_used(tmp_path, mode):
+def test_a_folder_that_others_may_write_to_is_not_used(tmp_path, unkept, mode):
     shared = tmp_path / "shared"
     shared.mkdir()
     shared.chmod(mode)
@@ -175,11 +173,8 @@ def test_flipped_bytes_are_compiled_anew(folder):
         run()
 
 
-def test_a_folder_that_cannot_be_written_to_costs_only_time(tmp_path):
+def test_a_folder_that_cannot_be_written_to_costs_only_time(tmp_path, unkept):
     blocked = tmp_path / "file"
     blocked.write_text("no folder")
     store.use(blocked / "programs")
-    try:
-        run()
-    finally:
-        store.use(None)
+    run()
