@@ -176,6 +176,7 @@ def assemble(
                 np.array([sets[line.set] for line in own])
                 if KINDS[kind].has_set
                 else None,
+                np.array([line.above or (0.0,) * len(line.points) for line in own]),
             )
         )
     at, held = _start(names, ground)

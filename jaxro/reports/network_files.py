@@ -69,6 +69,11 @@ class Done:
         )
 
     @property
+    def is_finite(self) -> bool:
+        """Whether there are numbers at all: the search has not diverged."""
+        return bool(np.all(np.isfinite(self.solution.coordinates)))
+
+    @property
     def usable(self) -> bool:
         """Whether the numbers may be used: everything is determined, and no test
         rejects."""
@@ -200,8 +205,11 @@ class Done:
 
     def table(self) -> list[dict[str, Any]]:
         """Every measurement: its points, what was measured, residual, redundancy, test,
-        and the errors that would be found and identified, in its unit."""
+        and the errors that would be found and identified, in its unit; none of them
+        where the search diverged."""
         found = []
+        if not self.is_finite:
+            return found
         for k, line in enumerate(self.lines):
             own = np.flatnonzero(self.measurement == k)
             unit = self.angle[0] if KINDS[line.kind].is_angle else 1.0
@@ -282,7 +290,7 @@ def summary(done: Done) -> dict[str, Any]:
         "global_p": done.global_p,
         "datum": done.solution.datum,
         "iterations": int(done.solution.adjusted.iterations),
-        "limit_p": done.limit if done.freedom > 0 else None,
+        "limit_p": done.limit if done.is_finite and done.freedom > 0 else None,
         "wrong": ["-".join(done.lines[k].points) for k in done.wrong],
         "points": {
             name: {"coordinates": list(at), "deviations": list(spread)}

@@ -6,13 +6,17 @@ between points, adjusted together.
     distance     |b - a| in plan
     direction    t(a, b) - o, o the orientation of its set
     angle        t(a, c) - t(a, b)
+    azimuth      t(a, b)
+    zenith       the angle between the vertical and b - a
     vector       b - a, with a covariance matrix
     position     a itself: coordinates that are known with a covariance matrix
+    plan         the same of X and Y
     X, Y, Z      one coordinate of a
 
 t(a, b) = arctan2(Y_b - Y_a, X_b - X_a), from the axis of X through that of Y: clockwise
 where X is north and Y is east. Angles are radians. A coordinate that no measurement
-touches is not part of the network; one that is held is known. Where the measurements
+touches is not part of the network; one that is held is known. An instrument or target
+stands above its point by a known height. Where the measurements
 leave the position of the network open, all points together are its datum: of all
 solutions the one next to the approximate coordinates (inner constraints, Meissl 1962).
 """
@@ -39,13 +43,15 @@ class Measured(NamedTuple):
     """Measurements of one kind: the numbers of the points of each (`at`; two or three,
     as the kind has), what was measured, and the lower triangle of the Cholesky factor
     of its covariance matrix (a standard deviation, of one number). `set`: of a
-    direction the number of its set."""
+    direction the number of its set. `above`: the heights of instrument and targets above
+    the points; zero, if None."""
 
     kind: str
     at: Int[np.ndarray, "measurement ends"]
     values: Float[np.ndarray, "measurement m"]
     roots: Float[np.ndarray, "measurement m m"]
     set: Int[np.ndarray, " measurement"] | None = None
+    above: Float[np.ndarray, "measurement ends"] | None = None
 
 
 class Kind(NamedTuple):
@@ -64,6 +70,12 @@ class Kind(NamedTuple):
 def azimuth(a: Point, b: Point) -> Float[Array, ""]:
     """t(a, b), from the axis of X through that of Y."""
     return jnp.arctan2(b[1] - a[1], b[0] - a[0])
+
+
+def zenith(a: Point, b: Point) -> Float[Array, ""]:
+    """The angle between the vertical at a and the line to b."""
+    x, y, z = b - a
+    return jnp.arctan2(jnp.sqrt(x**2 + y**2), z)
 
 
 PLAN, HEIGHT, SPACE = (True, True, False), (False, False, True), (True, True, True)
@@ -89,8 +101,11 @@ KINDS = {
         lambda a, b, c: (azimuth(a, c) - azimuth(a, b))[None],
         is_angle=True,
     ),
+    "azimuth": Kind(2, 1, PLAN, lambda a, b: azimuth(a, b)[None], is_angle=True),
+    "zenith": Kind(2, 1, SPACE, lambda a, b: zenith(a, b)[None], is_angle=True),
     "vector": Kind(2, 3, SPACE, lambda a, b: b - a),
     "position": Kind(1, 3, SPACE, lambda a: a),
+    "plan": Kind(1, 2, PLAN, lambda a: a[:2]),
     "X": Kind(1, 1, (True, False, False), lambda a: a[:1]),
     "Y": Kind(1, 1, (False, True, False), lambda a: a[1:2]),
     "Z": Kind(1, 1, HEIGHT, lambda a: a[2:]),
@@ -175,9 +190,11 @@ class _Condition(eqx.Module):
     kind: str = eqx.field(static=True)
 
     def __call__(self, *given: Array | tuple[Array, ...]) -> Float[Array, " m"]:
-        *blocks, (white, values, root) = given
+        *blocks, (white, values, root, above) = given
         kind = KINDS[self.kind]
-        off = kind.function(*blocks) - values
+        up = jnp.zeros((kind.ends, 3)).at[:, 2].set(above)
+        ends = [a + height for a, height in zip(blocks[: kind.ends], up, strict=True)]
+        off = kind.function(*ends, *blocks[kind.ends :]) - values
         if kind.is_angle:
             # the nearest of all full turns, which no derivative sees
             off = off - 2 * jnp.pi * jnp.round(off / (2 * jnp.pi))
@@ -189,10 +206,11 @@ def _term(part: Measured) -> Term:
     if part.set is not None:
         touches.append(("orientation", part.set))
     white = np.zeros(part.values.shape)
+    above = np.zeros(part.at.shape) if part.above is None else part.above
     return Term(
         _Condition(part.kind),
-        (white, part.values, part.roots),
-        (1.0, None, None),
+        (white, part.values, part.roots, above),
+        (1.0, None, None, None),
         touches=touches,
     )
 

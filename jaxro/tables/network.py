@@ -1,9 +1,9 @@
 """Tables of measurements between the points of a network: CSV text in, `Measurements`
 out, or one clear error.
 
-kind          height, distance (in plan), slope, direction, angle or vector; without
-              this column all are of the kind that the columns tell: difference is that
-              of heights, dX,dY,dZ are vectors
+kind          height, distance (in plan), slope, direction, angle, azimuth, zenith or
+              vector; without this column all are of the kind that the columns tell:
+              difference is that of heights, dX,dY,dZ are vectors
 from, to      names of the points; an angle at `from` is that from `to` to `other`
 value         what was measured (difference: of heights)
 sigma         its standard deviation, in the same unit
@@ -12,6 +12,9 @@ length_km     in place of sigma: the length of a line of levelling, whose varian
 dX, dY, dZ    of a vector, with sX, sY, sZ (or sigma) and cXY, cXZ, cYZ
 set           of directions: which of them were measured together; without it all from
               one point
+from_above    heights of the instrument over `from` and of the targets over `to` and
+to_above      `other`
+other_above
 """
 
 import io
@@ -29,11 +32,13 @@ from .survey_checks import Row
 VECTOR = ("dx", "dy", "dz")
 SIGMAS = ("sx", "sy", "sz")
 COVARIANCES = ("cxy", "cxz", "cyz")
+ENDS = ("from", "to", "other")
+ABOVE = tuple(f"{end}_above" for end in ENDS)
 NETWORK = Columns(
     ("from", "to"),
     (
         *("kind", "value", "difference", "sigma", "length_km", "other", "set"),
-        *(*VECTOR, *SIGMAS, *COVARIANCES),
+        *(*VECTOR, *SIGMAS, *COVARIANCES, *ABOVE),
     ),
     texts=("kind", "from", "to", "other", "set"),
 )
@@ -44,7 +49,8 @@ WORDS = tuple(name for name, kind in KINDS.items() if kind.ends > 1)
 class Measurement:
     """One line: its kind, the names of its points, what was measured, the lower triangle
     of the Cholesky factor of its covariance matrix, and the set of a direction. `line`
-    of the file. `is_relative`: it has a weight, and no standard deviation."""
+    of the file. `is_relative`: it has a weight, and no standard deviation. `above`: the
+    heights of instrument and targets above their points."""
 
     kind: str
     points: tuple[str, ...]
@@ -53,6 +59,7 @@ class Measurement:
     set: str
     line: int
     is_relative: bool = False
+    above: tuple[float, ...] = ()
 
 
 def read(path: Path, sigma: float | None) -> list[Measurement]:
@@ -79,7 +86,7 @@ def parse(text: str, file: str, sigma: float | None) -> list[Measurement]:
 
 def _measurement(row: Row, sigma: float | None) -> Measurement:
     kind = _kind(row)
-    columns = ("from", "to", "other")[: KINDS[kind].ends]
+    columns = ENDS[: KINDS[kind].ends]
     for column in columns:
         if column not in row.cells:
             raise TableError(
@@ -106,7 +113,11 @@ def _measurement(row: Row, sigma: float | None) -> Measurement:
         root = np.array([[_sigma(row, sigma)]])
     name = row.cells.get("set", "") or points[0]
     relative = sigma is None and not row.cells.get("sigma") and kind != "vector"
-    return Measurement(kind, points, values, root, name, row.line, relative)
+    above = tuple(
+        _number(row, column) if row.cells.get(column) else 0.0
+        for column in ABOVE[: len(points)]
+    )
+    return Measurement(kind, points, values, root, name, row.line, relative, above)
 
 
 def _kind(row: Row) -> str:

@@ -11,6 +11,8 @@ from jaxro.surveys.geodetic import Measured, Network, adjust_network
 
 POINTS = np.array([[0.0, 0, 10], [80, 15, 12], [30, 70, 9], [95, 90, 14], [40, 30, 11]])
 SIGMA = 0.01
+INSTRUMENT, TARGET = 1.5, 1.7
+ANGLES = ("direction", "angle", "azimuth", "zenith")
 
 
 def azimuth(p, a, b):
@@ -23,6 +25,13 @@ FUNCTIONS = {
     "distance": lambda p, at, o: [np.linalg.norm((p[at[1]] - p[at[0]])[:2])],
     "direction": lambda p, at, o: [azimuth(p, *at) - o],
     "angle": lambda p, at, o: [azimuth(p, at[0], at[2]) - azimuth(p, at[0], at[1])],
+    "azimuth": lambda p, at, o: [azimuth(p, *at)],
+    "zenith": lambda p, at, o: [
+        np.arctan2(
+            np.linalg.norm((p[at[1]] - p[at[0]])[:2]),
+            p[at[1], 2] + TARGET - p[at[0], 2] - INSTRUMENT,
+        )
+    ],
     "vector": lambda p, at, o: p[at[1]] - p[at[0]],
     "Z": lambda p, at, o: [p[at[0], 2]],
 }
@@ -33,6 +42,8 @@ AT = {
     "distance": [(0, 1), (0, 2), (1, 3), (2, 4), (3, 4)],
     "direction": [pair for pair in PAIRS if pair[0] in (0, 3)],
     "angle": [(4, 0, 1), (4, 1, 3), (1, 0, 2)],
+    "azimuth": [(4, 2)],
+    "zenith": [(4, 0), (1, 4)],
     "vector": [(0, 4), (2, 3)],
     "Z": [(2,)],
 }
@@ -53,7 +64,7 @@ def measure(seed: int = 4) -> tuple[Measured, ...]:
         exact = [FUNCTIONS[kind](POINTS, a, o) for a, o in zip(at, turn, strict=True)]
         values = np.array(exact)
         root = SIGMA * np.eye(values.shape[1])
-        if kind in ("direction", "angle"):
+        if kind in ANGLES:
             root = root / 100
             values = values + 2 * np.pi
         if kind == "vector":
@@ -62,7 +73,10 @@ def measure(seed: int = 4) -> tuple[Measured, ...]:
             values + (root @ rng.normal(size=(len(at), values.shape[1], 1)))[..., 0]
         )
         roots = np.broadcast_to(root, (len(at), *root.shape))
-        found.append(Measured(kind, np.array(at), values, roots, sets))
+        above = None
+        if kind == "zenith":
+            above = np.tile([INSTRUMENT, TARGET], (len(at), 1))
+        found.append(Measured(kind, np.array(at), values, roots, sets, above))
     return tuple(found)
 
 
@@ -75,7 +89,7 @@ def whitened(x, measured):
         for k, at in enumerate(part.at):
             turn = 0.0 if part.set is None else turns[part.set[k]]
             off = np.array(FUNCTIONS[part.kind](p, at, turn)) - part.values[k]
-            if part.kind in ("direction", "angle"):
+            if part.kind in ANGLES:
                 off = (off + np.pi) % (2 * np.pi) - np.pi
             out.append(np.linalg.solve(part.roots[k], off))
     return np.concatenate(out)

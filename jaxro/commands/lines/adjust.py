@@ -12,9 +12,9 @@ File = Annotated[
     Path | None,
     typer.Argument(
         help="CSV table of measurements between points: kind,from,to,value,sigma; kinds "
-        "are height, distance, slope, direction, angle (with other) and vector (dX,dY,dZ "
-        "with deviations and covariances). from,to,difference,sigma or length_km is a "
-        "net of levelling. Without it a simulated network.",
+        "are height, distance, slope, direction, angle (with other), azimuth, zenith and "
+        "vector (dX,dY,dZ with deviations and covariances). from,to,difference and sigma "
+        "or length_km is a net of levelling. Without it a simulated network.",
         metavar="NETWORK.csv",
         show_default=False,
     ),
