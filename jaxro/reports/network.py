@@ -28,9 +28,10 @@ def show(console: Console, done: Done) -> None:
         return
     console.print(_fit(done))
     if done.solution.datum:
+        of_all = done.solution.network.datum is None
         console.print(
             "Nothing is known of its position: a free network. Deviations are those "
-            "about all of its points."
+            f"about {'all of its points' if of_all else 'the points of its datum'}."
         )
     _show_points(console, done)
     _show_checks(console, done)

@@ -208,24 +208,26 @@ class Done:
         and the errors that would be found and identified, in its unit; none of them
         where the search diverged."""
         found = []
-        if not self.is_finite:
-            return found
         for k, line in enumerate(self.lines):
-            own = np.flatnonzero(self.measurement == k)
             unit = self.angle[0] if KINDS[line.kind].is_angle else 1.0
-            residuals = line.root @ self.rows.residuals[own] / unit
-            redundancy = np.asarray(self.normalised.redundancy)[own]
             row: dict[str, Any] = {
                 "kind": line.kind,
                 "points": "-".join(line.points),
                 "value": " ".join(repr(float(v / unit)) for v in line.values),
+            }
+            found.append(row)
+            if not self.is_finite:
+                continue
+            own = np.flatnonzero(self.measurement == k)
+            residuals = line.root @ self.rows.residuals[own] / unit
+            redundancy = np.asarray(self.normalised.redundancy)[own]
+            row |= {
                 "residual": " ".join(repr(float(v)) for v in residuals),
                 "redundancy": float(np.sum(redundancy)),
                 "p": float(self.tests.p[k]),
             }
             if self.is_scalar:
                 row |= self._of_scalar(k, float(line.root[0, 0]) / unit)
-            found.append(row)
         return found
 
     def _of_scalar(self, k: int, sigma: float) -> dict[str, Any]:

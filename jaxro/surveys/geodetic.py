@@ -17,8 +17,9 @@ t(a, b) = arctan2(Y_b - Y_a, X_b - X_a), from the axis of X through that of Y: c
 where X is north and Y is east. Angles are radians. A coordinate that no measurement
 touches is not part of the network; one that is held is known. An instrument or target
 stands above its point by a known height. Where the measurements
-leave the position of the network open, all points together are its datum: of all
-solutions the one next to the approximate coordinates (inner constraints, Meissl 1962).
+leave the position of the network open, all points together, or chosen ones, are its
+datum: of all solutions the one next to their approximate coordinates (inner
+constraints, Meissl 1962).
 """
 
 from collections.abc import Callable
@@ -115,11 +116,12 @@ KINDS = {
 
 class Network(NamedTuple):
     """A network: approximate `coordinates` of its points, which of these are `held`,
-    and what is measured."""
+    and what is measured. `datum`: those that a free network lies at, all, if None."""
 
     coordinates: Float[np.ndarray, "point 3"]
     held: Bool[np.ndarray, "point 3"]
     measured: tuple[Measured, ...]
+    datum: Bool[np.ndarray, "point 3"] | None = None
 
     @property
     def touched(self) -> Bool[np.ndarray, "point 3"]:
@@ -175,8 +177,10 @@ def adjust_network(network: Network) -> Solution:
     open_ways = _open_ways(terms, start, held)
     constraints = None
     if len(open_ways):
-        of_points = jnp.asarray(open_ways[:, : network.held.size])
-        constraints = _InnerConstraints(of_points, start["point"])
+        of_points = open_ways[:, : network.held.size]
+        if network.datum is not None:
+            of_points = of_points * network.datum.ravel()
+        constraints = _InnerConstraints(jnp.asarray(of_points), start["point"])
     adjusted = adjust(terms, start, held=held, constraints=constraints)
     moved = np.max(np.abs(open_ways[:, : network.held.size]), axis=0, initial=0.0)
     is_moved = moved.reshape(network.held.shape) > STILL

@@ -64,6 +64,32 @@ def test_weights_by_the_length_of_lines(tmp_path):
         assert one["tau"] == pytest.approx(other["tau"], abs=1e-9)
 
 
+def test_xml_of_gama_is_the_same_net(tmp_path):
+    lines = [line.split(",") for line in MIKHAIL.splitlines()[1:]]
+    rises = "".join(
+        f'<dh from="{a}" to="{b}" val="{rise}" dist="{km}"/>'
+        for a, b, rise, km in lines
+    )
+    points = "".join(f'<point id="{name}" adj="z"/>' for name in "BCDE")
+    (tmp_path / "net.xml").write_text(
+        '<?xml version="1.0"?><gama-local><network><parameters sigma-apr="1000"/>'
+        f'<points-observations><point id="A" z="800" fix="z"/>{points}'
+        f"<height-differences>{rises}</height-differences></points-observations>"
+        "</network></gama-local>"
+    )
+    found = json.loads(run("adjust", tmp_path / "net.xml", "--json").stdout)
+    same = adjusted(tmp_path, MIKHAIL, "point,Z\nA,800\n")
+    assert not found["sigma_known"]
+    for name, value in (("sigma0", found["sigma0"]), ("datum", 0)):
+        assert value == pytest.approx(same[name], rel=1e-9)
+    for name, point in found["points"].items():
+        assert point["coordinates"][2] == pytest.approx(
+            same["points"][name]["coordinates"][2], abs=1e-9
+        )
+    told = run("adjust", tmp_path / "net.xml", "--sigma", "1")
+    assert told.exit_code == 2 and "--sigma: found it beside" in words(told.output)
+
+
 def test_the_wrong_measurement_of_the_example_is_named(tmp_path):
     told = run("adjust", "--out", tmp_path / "out")
     assert told.exit_code == 1

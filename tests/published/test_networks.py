@@ -5,6 +5,7 @@ and directions clockwise."""
 
 import json
 
+import charamza
 import numpy as np
 import pytest
 from command_line import run
@@ -178,3 +179,30 @@ def test_axes_the_wrong_way_round_are_no_solution(tmp_path):
     told = adjust(tmp_path, "Wolf, free", "point,X,Y,role")
     assert told.exit_code == 1, told.output
     assert json.loads(told.stdout)["result"] == "diverged"
+
+
+@pytest.mark.slow
+def test_the_example_of_gama_to_its_printed_digits(tmp_path):
+    """From two known points alone. GNU Gama takes one step from coordinates some 10 mm
+    away, so that its m0 is right to 2e-5."""
+    (tmp_path / "charamza.gkf").write_text(charamza.as_xml())
+    told = run("adjust", tmp_path / "charamza.gkf", "--json")
+    found = json.loads(told.stdout)
+    assert found["degrees_of_freedom"] == 37 and not found["sigma_known"]
+    np.testing.assert_allclose(10 * found["sigma0"], charamza.M0, 0, 0.5e-4)
+    for line in charamza.ADJUSTED.splitlines():
+        point, x, y = line.split()
+        at = found["points"][point]["coordinates"][:2]
+        np.testing.assert_allclose(at, [float(x), float(y)], 0, 1e-6)
+    spread = found["points"]["403"]["deviations"][0]
+    np.testing.assert_allclose((1000 * spread) ** 2, charamza.VARIANCE_403, 1e-5)
+    lines, points = charamza.as_tables()
+    (tmp_path / "network.csv").write_text(lines)
+    (tmp_path / "points.csv").write_text(points)
+    tables = tmp_path / "network.csv", "--points", tmp_path / "points.csv"
+    told = run("adjust", *tables, "--angles", "gon", "--unknown-sigma0", "--json")
+    same = json.loads(told.stdout)
+    for name, point in found["points"].items():
+        np.testing.assert_allclose(
+            point["coordinates"][:2], same["points"][name]["coordinates"][:2], 1e-12
+        )

@@ -14,7 +14,8 @@ File = Annotated[
         help="CSV table of measurements between points: kind,from,to,value,sigma; kinds "
         "are height, distance, slope, direction, angle (with other), azimuth, zenith and "
         "vector (dX,dY,dZ with deviations and covariances). from,to,difference and sigma "
-        "or length_km is a net of levelling. Without it a simulated network.",
+        "or length_km is a net of levelling. A file .xml or .gkf is input of "
+        "GNU Gama. Without it a simulated network.",
         metavar="NETWORK.csv",
         show_default=False,
     ),
