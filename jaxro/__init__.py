@@ -93,6 +93,7 @@ from .orientation.pure_rotation import (
 )
 from .orientation.result import Orientation as Orientation
 from .orientation.results import RESULTS as RESULTS, is_usable as is_usable
+from .statistics.promise import Promise as Promise, promise as promise
 from .xla.notices import announce as announce
 from .xla.settings import compiler_options as compiler_options
 from .xla.store import keep_programs as keep_programs

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..reports import network as report
-from ..reports.network_files import Done, contents, summary
+from ..reports.network_files import Done, Simulated, contents, summary
 from ..reports.terminal import consoles, say_what
 from ..surveys.geodetic import adjust_network
 from ..tables import whole
 from ..tables.fields import TableError
+from ..tables.network import Measurement
 from .documents import show_json
 from .network_input import ANGLES, XML, assemble, read
 
@@ -28,6 +29,9 @@ class Options:
     out: Path | None = None
     force: bool = False
     json: bool = False
+    promise: int | None = None
+    wrong: int = 1
+    size: float = 6.0
 
 
 def run(options: Options) -> bool:
@@ -69,6 +73,10 @@ def calculate(options: Options) -> Done:
     )
     names = list(dict.fromkeys(name for line in given.lines for name in line.points))
     network, lines = assemble(given, names)
+    simulated = None
+    if options.promise is not None:
+        _check_promise(options, lines)
+        simulated = Simulated(options.promise, options.wrong, options.size)
     with say_what("Adjusting the network ..."):
         solution = adjust_network(network)
     return Done(
@@ -81,6 +89,7 @@ def calculate(options: Options) -> Done:
         solution=solution,
         sigma_known=given.sigma_known and not options.sigma0_unknown,
         level=options.level,
+        simulated=simulated,
         warnings=given.warnings,
     )
 
@@ -117,3 +126,22 @@ def _check(options: Options) -> None:
                 found=f"it beside {options.file}",
                 expected="no such option: an XML file of GNU Gama says it itself",
             )
+
+
+def _check_promise(options: Options, lines: list[Measurement]) -> None:
+    """Raises TableError for what cannot be simulated."""
+    several = [line for line in lines if len(line.values) > 1]
+    if several:
+        raise TableError(
+            "--promise",
+            found=f"it with a {several[0].kind} (line {several[0].line})",
+            expected="a network whose measurements are single numbers",
+        )
+    if not 0 <= options.wrong < len(lines):
+        raise TableError(
+            "--wrong",
+            found=str(options.wrong),
+            expected=f"0, or less than the {len(lines)} measurements",
+        )
+    if not math.isfinite(options.size):
+        raise TableError("--size", found=repr(options.size), expected="a number")

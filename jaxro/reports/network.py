@@ -36,6 +36,8 @@ def show(console: Console, done: Done) -> None:
     _show_points(console, done)
     _show_checks(console, done)
     _show_measurements(console, done)
+    for sentence in _promise(done):
+        console.print(sentence)
     for warning in done.warnings:
         console.print(f"[yellow]Mind:[/yellow] {escape(warning)}")
 
@@ -74,6 +76,32 @@ def _verdict(done: Done) -> str:
         f"[bold red]One of {escape(', '.join(names))} is wrong[/bold red], and nothing "
         "tells which: the others fit without any one of them. Measure them again."
     )
+
+
+def _promise(done: Done) -> list[str]:
+    """What verdicts and intervals are worth, by simulation."""
+    told, asked = done.promise, done.simulated
+    if told is None or asked is None:
+        return []
+    percent = lambda share: "-" if np.isnan(share) else f"{share:.1%}"
+    intervals = told.reported if done.sigma_known else told.estimated
+    held = f"{percent(np.min(intervals))} to {percent(np.max(intervals))}"
+    errors = f"{asked.wrong} wrong measurements of {asked.size:g} standard deviations"
+    if asked.wrong == 0:
+        errors = "no wrong measurement"
+    elif asked.wrong == 1:
+        errors = f"a wrong measurement of {asked.size:g} standard deviations"
+    return [
+        f"In {told.repetitions} simulated networks like this one, with {errors}: all are "
+        f"said to fit in {percent(told.fits.said)}; one is named in "
+        f"{percent(told.named.said)}, rightly in {percent(told.named.right)} of these; "
+        f"several are in {percent(told.several.said)}, a wrong one among them in "
+        f"{percent(told.several.right)}.",
+        "Where a measurement that is named alone is left out and the rest adjusted "
+        f"again, {percent(told.accepted)} pass all tests in the end, "
+        f"{percent(told.exactly_right)} without just the wrong ones; of those that pass, "
+        f"intervals of {told.confidence:.0%} hold the true coordinates in {held}.",
+    ]
 
 
 def _name(done: Done, k: int) -> str:

@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,9 @@ from ..statistics.groups import (
 )
 from ..statistics.identification import Identified, identify
 from ..statistics.normalised import Normalised
+from ..statistics.promise import Promise, Verdict, promise
 from ..statistics.rows import Rows, normalise_rows, rows
-from ..surveys.geodetic import KINDS, Solution
+from ..surveys.geodetic import KINDS, Solution, displacements
 from ..tables.ground import GroundPoints
 from ..tables.network import Measurement
 from ..xla.programs import compiled
@@ -31,11 +32,21 @@ from . import files
 AXES = ("X", "Y", "Z")
 
 
+class Simulated(NamedTuple):
+    """What is simulated: so many repetitions, each with so many wrong measurements whose
+    errors are `size` standard deviations."""
+
+    repetitions: int
+    wrong: int
+    size: float
+
+
 @dataclass(frozen=True)
 class Done:
     """A finished network. `names` of the points; `lines`: the measurements in the order
     of the terms; `angle`: radians of one unit of angles and its name. `sigma_known`:
-    sigma0 is to be 1. `level`: of all tests together."""
+    sigma0 is to be 1. `level`: of all tests together. `simulated`: what is promised of
+    networks like this one."""
 
     title: str
     unit: str
@@ -47,6 +58,7 @@ class Done:
     sigma_known: bool
     level: float
     seed: int = 0
+    simulated: Simulated | None = None
     warnings: list[str] = field(default_factory=list)
 
     # ---------------------------------------------------------------------------------
@@ -203,6 +215,26 @@ class Done:
             familywise=True,
         )
 
+    @cached_property
+    def promise(self) -> Promise | None:
+        """What verdicts and intervals are worth in networks like this one; None where
+        nobody asked, or nothing is tested."""
+        if self.simulated is None or self.result != "successful" or self.freedom < 1:
+            return None
+        if not self.is_scalar:
+            return None
+        _, functions = displacements(self.solution)
+        return promise(
+            self.rows,
+            jax.random.key(self.seed),
+            wrong=self.simulated.wrong,
+            size=self.simulated.size,
+            functions=functions,
+            level=self.level,
+            estimated=not self.sigma_known,
+            repetitions=self.simulated.repetitions,
+        )
+
     def table(self) -> list[dict[str, Any]]:
         """Every measurement: its points, what was measured, residual, redundancy, test,
         and the errors that would be found and identified, in its unit; none of them
@@ -304,4 +336,18 @@ def summary(done: Done) -> dict[str, Any]:
             )
         },
         "measurements": done.table(),
+        **({"promise": _told(done.promise)} if done.promise else {}),
     }
+
+
+def _told(told: Promise) -> dict[str, Any]:
+    """A promise for programs: shares from 0 to 1, of coordinates their means."""
+    found: dict[str, Any] = {}
+    for name, value in told._asdict().items():
+        if isinstance(value, Verdict):
+            found[name] = value._asdict()
+        elif isinstance(value, np.ndarray):
+            found[name] = float(np.mean(value))
+        else:
+            found[name] = value
+    return found

@@ -6,4 +6,6 @@ would be found.
     familywise         critical values of the largest |w| or |tau|
     explanations       rows that explain a misfit equally well
     identification     errors that are attributed to the right row
+    groups             tests of several rows together
+    promise            what verdicts and intervals are worth, by simulation
 """

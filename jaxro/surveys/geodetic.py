@@ -148,17 +148,23 @@ class Network(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """An adjusted network, with its `terms` and what was held; `datum`: how many numbers
-    of position, rotation and scale the measurements left open; `loose`: the points that
-    these move although others are known in the same coordinates, and which therefore
-    are not determined."""
+    """An adjusted network, with its `terms` and what was held; `ways`: displacements
+    that the measurements left open, of position, rotation and scale; `loose`: the points
+    that these move although others are known in the same coordinates, and which
+    therefore are not determined."""
 
     network: Network
     adjusted: JointAdjustment
     terms: tuple[Term, ...]
     held: dict[str, Bool[np.ndarray, "_ _"]]
-    datum: int
+    ways: Float[np.ndarray, "way p"]
     loose: Bool[np.ndarray, " point"]
+
+    @property
+    def datum(self) -> int:
+        """How many numbers of position, rotation and scale the measurements left
+        open."""
+        return len(self.ways)
 
     @property
     def coordinates(self) -> Float[np.ndarray, "point 3"]:
@@ -177,15 +183,42 @@ def adjust_network(network: Network) -> Solution:
     open_ways = _open_ways(terms, start, held)
     constraints = None
     if len(open_ways):
-        of_points = open_ways[:, : network.held.size]
-        if network.datum is not None:
-            of_points = of_points * network.datum.ravel()
-        constraints = _InnerConstraints(jnp.asarray(of_points), start["point"])
+        of_points = jnp.asarray(_of_datum(network, open_ways))
+        constraints = _InnerConstraints(of_points, start["point"])
     adjusted = adjust(terms, start, held=held, constraints=constraints)
     moved = np.max(np.abs(open_ways[:, : network.held.size]), axis=0, initial=0.0)
     is_moved = moved.reshape(network.held.shape) > STILL
     loose = np.any(is_moved & np.any(network.known, axis=0), axis=1)
-    return Solution(network, adjusted, terms, held, len(open_ways), loose)
+    return Solution(network, adjusted, terms, held, open_ways, loose)
+
+
+def displacements(
+    solution: Solution,
+) -> tuple[Bool[np.ndarray, "point 3"], Float[np.ndarray, "coordinate p"]]:
+    """The coordinates that are adjusted, and their displacements as linear functions of
+    all parameters: in a free network, against its datum (Baarda's S-transformation)."""
+    network = solution.network
+    free = network.touched & ~network.held
+    size = network.held.size + network.sets
+    found = np.eye(size)[np.flatnonzero(free)]
+    if solution.datum:
+        of_datum = _of_datum(network, solution.ways)
+        ways = solution.ways[:, : network.held.size]
+        shift = np.linalg.solve(of_datum @ ways.T, of_datum)
+        back = solution.ways.T[np.flatnonzero(free)] @ shift
+        found[:, : network.held.size] -= back
+    # in the order of the families of the solution, which is that of its rows
+    of_points, of_sets = np.split(found, [network.held.size], axis=1)
+    parts = {"point": of_points, "orientation": of_sets}
+    return free, np.hstack([parts[name] for name in solution.adjusted.parameters])
+
+
+def _of_datum(
+    network: Network, ways: Float[np.ndarray, "way p"]
+) -> Float[np.ndarray, "way own"]:
+    """The part of open ways that the points of the datum may not go."""
+    of_points = ways[:, : network.held.size]
+    return of_points if network.datum is None else of_points * network.datum.ravel()
 
 
 class _Condition(eqx.Module):

@@ -1,10 +1,15 @@
 """`jaxro adjust`: published nets, what is named, what is refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from command_line import run, words
+
+from jaxro.commands.adjust import Options, calculate
+from jaxro.statistics.promise import repeat_job
+from jaxro.surveys.geodetic import adjust_network
 
 SIKI = """\
 from,to,difference,sigma
@@ -114,6 +119,25 @@ def test_legs_of_one_line_are_named_together(tmp_path):
     assert told["wrong"] == ["a-m", "m-b"] and not told["usable"]
 
 
+def test_the_promise_of_a_net(tmp_path):
+    """A free net has the intervals and verdicts of the same net with a known point."""
+    ask = ("--sigma", "0.3", "--promise", "300", "--size", "8")
+    found = adjusted(tmp_path, MIKHAIL, "point,Z\nA,800\n", *ask)["promise"]
+    free = adjusted(tmp_path, MIKHAIL, "", *ask)["promise"]
+    shares = [found[name]["said"] for name in ("fits", "named", "several")]
+    assert sum(shares) == pytest.approx(1) and found["named"]["right"] > 0.9
+    for name in ("fits", "named", "several", "accepted", "exactly_right"):
+        assert found[name] == pytest.approx(free[name], nan_ok=True)
+    shown = run("adjust", tmp_path / "network.csv", *ask)
+    said = "In 300 simulated networks like this one, with a wrong measurement of 8"
+    assert said in words(shown.stdout)
+    told = run("adjust", "--promise", "100", "--wrong", "0")
+    assert (
+        "In 100 simulated networks like this one, with no wrong measurement"
+        in words(told.stdout)
+    )
+
+
 def test_points_that_nothing_joins_to_known_ones_are_named(tmp_path):
     apart = MIKHAIL + "P,Q,1.5,2.0\nQ,R,0.5,2.0\nP,R,2.0,2.0\n"
     (tmp_path / "network.csv").write_text(apart)
@@ -123,6 +147,13 @@ def test_points_that_nothing_joins_to_known_ones_are_named(tmp_path):
     assert "not determined: nothing tells where the points P, Q, R" in words(
         told.stdout
     )
+
+
+def test_a_promise_of_vectors_is_refused(tmp_path):
+    (tmp_path / "network.csv").write_text("from,to,dX,dY,dZ,sigma\na,b,1,2,3,1\n")
+    told = run("adjust", tmp_path / "network.csv", "--promise", "100")
+    assert told.exit_code == 2
+    assert "--promise: found it with a vector (line 2)" in words(told.output)
 
 
 @pytest.mark.parametrize(
@@ -150,3 +181,31 @@ def test_bad_tables_say_where(network, said, tmp_path):
     told = run("adjust", tmp_path / "network.csv", "--out", tmp_path / "out")
     assert told.exit_code == 2 and said in words(told.output), told.output
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_the_simulated_job_is_that_of_the_program():
+    """The example with new errors in its measurements, adjusted and judged as it is:
+    the same measurements are named as by the linear job of the promise."""
+    done = calculate(Options())
+    network = done.solution.network
+    rng = np.random.default_rng(5)
+    count, n = 80, len(done.lines)
+    errors = rng.normal(size=(count, n))
+    errors[np.arange(count), rng.integers(0, n, count)] += 7.0
+    found = repeat_job(done.rows, errors, level=done.level)
+    residuals = done.rows.residuals
+    sizes = np.cumsum([len(part.at) for part in network.measured])[:-1]
+    same = 0
+    for k, e in enumerate(errors):
+        parts = zip(network.measured, np.split(residuals + e, sizes), strict=True)
+        measured = tuple(
+            part._replace(values=part.values + part.roots[:, :, 0] * off[:, None])
+            for part, off in parts
+        )
+        again = replace(
+            done, solution=adjust_network(network._replace(measured=measured))
+        )
+        same += np.flatnonzero(found.named[k]).tolist() == again.wrong
+    assert same >= count - 1
+    assert 0.2 * count < np.sum(np.sum(found.named, axis=1) == 1) < count

@@ -7,7 +7,7 @@ import pytest
 
 from jaxro.statistics.groups import assess_groups
 from jaxro.statistics.rows import normalise_rows, rows
-from jaxro.surveys.geodetic import Measured, Network, adjust_network
+from jaxro.surveys.geodetic import Measured, Network, adjust_network, displacements
 
 POINTS = np.array([[0.0, 0, 10], [80, 15, 12], [30, 70, 9], [95, 90, 14], [40, 30, 11]])
 SIGMA = 0.01
@@ -152,6 +152,19 @@ def test_a_network_of_all_kinds_is_that_of_numpy(solved, measured):
     np.testing.assert_allclose(
         found.adjusted.cofactors("point"), blocks, atol=2e-5 * np.max(blocks)
     )
+
+
+def test_displacements_are_those_of_the_datum(solved):
+    """Their covariances by a pseudo-inverse are the cofactors of the adjustment."""
+    _, _, found = solved
+    free, functions = displacements(found)
+    design = rows(found.terms, found.adjusted.parameters, held=found.held).design
+    length = np.linalg.norm(design, axis=0)
+    length[length == 0] = 1
+    inverse = functions / length @ np.linalg.pinv(design / length, rcond=1e-9)
+    cofactors = np.asarray(found.adjusted.cofactors("point"))
+    variances = np.diagonal(cofactors, axis1=1, axis2=2)[free]
+    np.testing.assert_allclose(np.sum(inverse**2, axis=1), variances, rtol=1e-6)
 
 
 def test_a_vector_is_tested_as_a_whole(measured):

@@ -68,6 +68,24 @@ Out = Annotated[
         show_default=False,
     ),
 ]
+Promise = Annotated[
+    int | None,
+    typer.Option(
+        min=100,
+        help="Simulate so many networks like this one and judge them, too: how often each "
+        "verdict is right, and what the intervals hold. 1000 tells it to 1 %.",
+        metavar="N",
+        show_default=False,
+    ),
+]
+Wrong = Annotated[
+    int,
+    typer.Option(help="Wrong measurements in each of them.", metavar="K"),
+]
+Size = Annotated[
+    float,
+    typer.Option(help="Their errors, in standard deviations.", metavar="S"),
+]
 
 
 def adjust(
@@ -78,6 +96,9 @@ def adjust(
     level: Level = 0.05,
     angles: Angles = "degrees",
     unit: Unit = "m",
+    promise: Promise = None,
+    wrong: Wrong = 1,
+    size: Size = 6.0,
     out: Out = None,
     force: given.Force = False,
     json: given.Json = False,
@@ -101,5 +122,8 @@ def adjust(
         out=out,
         force=force,
         json=json,
+        promise=promise,
+        wrong=wrong,
+        size=size,
     )
     end(lambda: run(options))
