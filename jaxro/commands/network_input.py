@@ -1,6 +1,7 @@
 """What is read of a network, and the network that is made of it."""
 
 import math
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -40,6 +41,19 @@ class Given:
     sigma_known: bool
     constrained: Bool[np.ndarray, "point 3"] | None = None
     warnings: list[str] = field(default_factory=list)
+
+
+def is_network(file: Path | None) -> bool:
+    """Whether a file is a network by its name or its columns; one that cannot be read
+    is none."""
+    if file is None or file.suffix.lower() in XML:
+        return file is not None
+    try:
+        with file.open(encoding="utf-8-sig") as opened:
+            header = opened.readline(10_000).lower()
+    except (OSError, UnicodeDecodeError):
+        return False
+    return {"from", "to"} <= {name.strip() for name in re.split("[,;\t]", header)}
 
 
 def read(

@@ -62,7 +62,7 @@ def reproduce(name: str, trials: int | None, seed: int | None) -> bool:
                 found=f"it with {name}",
                 expected="no such option: nothing is random there",
             )
-    _check_trials(trials)
+    check_trials(trials)
     console, errors = consoles()
     with progress(errors, "Calculating", None if experiment.random else 1) as told:
         random = (experiment.trials if trials is None else trials, seed or 0, told)
@@ -78,9 +78,9 @@ def run_comparison(options: Options, wanted: Wanted) -> bool:
     procedures = {
         name: find_procedure(name) for name in wanted.procedures or PROCEDURES
     }
-    errors = _numbers("--errors", wanted.errors, int)
-    sizes = _numbers("--size", wanted.sizes, float)
-    _check_trials(wanted.trials)
+    errors = numbers("--errors", wanted.errors, int)
+    sizes = numbers("--size", wanted.sizes, float)
+    check_trials(wanted.trials)
     if not 0 <= wanted.false_alarms < 1:
         raise TableError(
             "--false-alarms",
@@ -233,14 +233,14 @@ def rows(found: Comparison) -> list[list[Any]]:
         )
         field, value = (set_to.name, set_to.value) if set_to else ("", None)
         shares = s.found, s.misnamed, s.lost, s.perfect, s.alarms, s.unfinished
-        numbers = [number for e in (*shares, s.angle) for number in e]
+        values = [number for e in (*shares, s.angle) for number in e]
         table.append(
-            [*s.setting, s.procedure, s.calibrated, field, value, s.trials, *numbers]
+            [*s.setting, s.procedure, s.calibrated, field, value, s.trials, *values]
         )
     return table
 
 
-def _numbers(option: str, text: str, kind: Callable[[str], T]) -> list[T]:
+def numbers(option: str, text: str, kind: Callable[[str], T]) -> list[T]:
     """Numbers of a list such as 8,10,15; whole ones from 0, others above 0."""
     try:
         values = [kind(part) for part in text.split(",")]
@@ -260,6 +260,6 @@ def _numbers(option: str, text: str, kind: Callable[[str], T]) -> list[T]:
     return list(dict.fromkeys(values))
 
 
-def _check_trials(trials: int | None) -> None:
+def check_trials(trials: int | None) -> None:
     if trials is not None and trials < 1:
         raise TableError("--trials", found=repr(trials), expected="1 or more")

@@ -52,7 +52,7 @@ def _clean_table(scores: list[Score]) -> "Table":
     rows = table("no errors", "false alarms", "good lost", "undone", "angle [']")
     for s in scores:
         rows.add_row(
-            s.procedure, *map(_percent, (s.alarms, s.lost, s.unfinished)), _angle(s)
+            s.procedure, *map(percent, (s.alarms, s.lost, s.unfinished)), _angle(s)
         )
     return rows
 
@@ -74,7 +74,7 @@ def _error_table(scores: list[Score]) -> "Table":
         title = f"{setting.errors} x {setting.size:g}σ"
         for s in members:
             shares = map(
-                _percent, (s.found, s.misnamed, s.lost, s.perfect, s.unfinished)
+                percent, (s.found, s.misnamed, s.lost, s.perfect, s.unfinished)
             )
             rows.add_row(title, s.procedure, *shares, _angle(s))
             title = ""
@@ -88,15 +88,15 @@ def _setting_table(calibrations: dict[str, Calibration]) -> "Table":
     return rows
 
 
-def _percent(e: Estimate) -> str:
-    return _with_error(100 * e.value, 100 * e.error, 1)
+def percent(e: Estimate) -> str:
+    return with_error(100 * e.value, 100 * e.error, 1)
 
 
 def _angle(s: Score) -> str:
-    return _with_error(*s.angle, 2)
+    return with_error(*s.angle, 2)
 
 
-def _with_error(value: float, error: float, digits: int) -> str:
+def with_error(value: float, error: float, digits: int) -> str:
     """The value and its standard error, which a single trial does not have; a dash for
     what does not exist."""
     if math.isnan(value):

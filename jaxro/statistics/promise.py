@@ -16,6 +16,7 @@ T Qᵀ e. Without a row q of Q both are those of
 that is, the rest of Q M, which is orthonormal again, and T M.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -26,12 +27,13 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, ScalarLike
 
 from ..adjustment import critical_values as critical
 from ..xla.programs import compiled
-from .explanations import misfit
-from .familywise import largest_tau, largest_w
+from .explanations import DOUBT, misfit
+from .familywise import largest_tau
+from .identification import critical_w
 from .normalised import Normalised, normalise
 from .rows import SMALL, Rows
 
-TOGETHER = 32
+TOGETHER = 16
 """Repetitions that are computed at once."""
 
 
@@ -100,17 +102,10 @@ def promise(
     of any sign. `functions`: linear ones of the parameters, that the rows determine; all
     parameters that they depend on, if None. `estimated`: sigma0 is not known.
     """
-    of_noise, of_places, of_signs = jax.random.split(key, 3)
-    shape = repetitions, len(given.use)
-    noise = np.asarray(jax.random.normal(of_noise, shape, float))
-    checked = np.asarray(_checked(given))
-    score = np.asarray(jax.random.uniform(of_places, shape, float))
-    rank = np.argsort(np.argsort(np.where(checked, score, 2.0), axis=1), axis=1)
-    planted = checked & (rank < wrong)
-    sign = np.where(jax.random.bernoulli(of_signs, shape=shape), 1.0, -1.0)
+    errors, planted = draw_errors(given, key, wrong, size, repetitions)
     trials = repeat_job(
         given,
-        noise + np.where(planted, size * sign, 0.0),
+        errors,
         functions=functions,
         level=level,
         estimated=estimated,
@@ -120,6 +115,22 @@ def promise(
     return _conclude(trials, planted, confidence)
 
 
+def draw_errors(
+    given: Rows, key: PRNGKeyArray, wrong: int, size: float, repetitions: int
+) -> tuple[Float[np.ndarray, "repetition row"], Bool[np.ndarray, "repetition row"]]:
+    """Errors of all rows, and in which there is one of this size in addition."""
+    of_noise, of_places, of_signs = jax.random.split(key, 3)
+    shape = repetitions, len(given.use)
+    noise = np.asarray(jax.random.normal(of_noise, shape, float))
+    score = np.asarray(jax.random.uniform(of_places, shape, float))
+    q, _ = orthonormal(given)
+    checked = given.use & (1 - np.sum(q**2, axis=1) > critical.UNTESTABLE)
+    rank = np.argsort(np.argsort(np.where(checked, score, 2.0), axis=1), axis=1)
+    planted = checked & (rank < wrong)
+    sign = np.where(jax.random.bernoulli(of_signs, shape=shape), 1.0, -1.0)
+    return noise + np.where(planted, size * sign, 0.0), planted
+
+
 def repeat_job(
     given: Rows,
     errors: Float[np.ndarray, "repetition row"],
@@ -127,15 +138,18 @@ def repeat_job(
     functions: Float[np.ndarray, "function p"] | None = None,
     level: ScalarLike = 0.05,
     estimated: bool = False,
+    familywise: bool = True,
+    doubt: ScalarLike = DOUBT,
     confidence: float = 0.95,
     rounds: int = 3,
 ) -> Trials:
-    """The job with these errors of the rows; at most so many `rounds` leave a row
-    out."""
-    q, t = _orthonormal(given)
+    """The job with these errors of the rows; at most so many `rounds` leave a row out.
+    `familywise`, `doubt`: as in `identification.identify`; only w has a level of each
+    test."""
+    q, t = orthonormal(given)
     if functions is None:
         functions = np.eye(len(t))[np.any(given.design[given.use] != 0, axis=0)]
-    freedom = np.sum(given.use) - q.shape[1] - np.arange(rounds + 1)
+    freedom = np.sum(given.use) - q.shape[1] - np.arange(len(q) + 1)
     widths = critical.half_width(confidence, freedom)
     found = _repeat(
         q,
@@ -143,20 +157,17 @@ def repeat_job(
         np.asarray(given.use),
         errors,
         np.asarray(widths),
+        np.asarray(rounds),
         level=level,
         normal=float(critical.normal(1 - confidence)),
+        doubt=doubt,
         estimated=estimated,
-        rounds=rounds,
+        familywise=familywise,
     )
     return Trials(*(np.asarray(part) for part in found))
 
 
-def _checked(given: Rows) -> Bool[np.ndarray, " row"]:
-    q, _ = _orthonormal(given)
-    return given.use & (1 - np.sum(q**2, axis=1) > critical.UNTESTABLE)
-
-
-def _orthonormal(
+def orthonormal(
     given: Rows,
 ) -> tuple[Float[np.ndarray, "row rank"], Float[np.ndarray, "p rank"]]:
     """Q and T: the estimates of the parameters are T Qᵀ e, of all that leave the rows
@@ -183,30 +194,38 @@ class _State(NamedTuple):
     accepted: Bool[Array, ""]
 
 
-@compiled(static=("estimated", "rounds"))
+@compiled(static=("estimated", "familywise"))
 def _repeat(
     q: Float[Array, "row rank"],
     t: Float[Array, "function rank"],
     use: Bool[Array, " row"],
     errors: Float[Array, "repetition row"],
     widths: Float[Array, " number"],
+    rounds: Int[Array, ""],
     *,
     level: ScalarLike,
     normal: ScalarLike,
+    doubt: ScalarLike,
     estimated: bool,
-    rounds: int,
+    familywise: bool,
 ) -> tuple[Array, ...]:
     """The fields of `Trials`."""
     no, none = jnp.asarray(False), jnp.asarray(0)
     start = _State(q, t, use, none, no, no)
 
+    def test(known: Normalised) -> Bool[Array, " row"]:
+        of_w = lambda: critical_w(known, level, familywise)
+        limit = largest_tau(level, known) if estimated else of_w()
+        return misfit(known, limit, doubt, estimated)[1]
+
     def job(e: Float[Array, " row"]) -> tuple[Array, ...]:
-        state, named = _round(start, e, level, estimated)
-
-        def again(state: _State, _: None) -> tuple[_State, None]:
-            return _round(state, e, level, estimated)[0], None
-
-        state, _ = lax.scan(again, state, None, length=rounds)
+        # the first round is one for all: its limit is computed once
+        state, named = _round(start, e, test, rounds)
+        state = lax.while_loop(
+            lambda state: ~state.ended,
+            lambda state: _round(state, e, test, rounds)[0],
+            state,
+        )
         known = _normalised(state, e)
         away = jnp.abs(state.t @ (state.q.T @ e))
         spread = jnp.sqrt(jnp.sum(state.t**2, axis=1))
@@ -227,14 +246,16 @@ def _repeat(
 
 
 def _round(
-    state: _State, e: Float[Array, " row"], level: ScalarLike, estimated: bool
+    state: _State,
+    e: Float[Array, " row"],
+    test: Callable[[Normalised], Array],
+    rounds: Int[Array, ""],
 ) -> tuple[_State, Bool[Array, " row"]]:
     """One test; a row that is named alone is left out. The rows that are named."""
-    known = _normalised(state, e)
-    limit = largest_tau if estimated else largest_w
-    _, named = misfit(known, limit(level, known), estimated=estimated)
+    named = test(_normalised(state, e))
     number = jnp.sum(named)
-    alone = named & (number == 1) & ~state.ended
+    goes_on = (number == 1) & ~state.ended & (state.out < rounds)
+    alone = named & goes_on
     row = jnp.sum(jnp.where(alone[:, None], state.q, 0.0), axis=0)
     square = jnp.sum(row**2)
     some = square > 0
@@ -245,8 +266,8 @@ def _round(
         q=jnp.where(alone[:, None], 0.0, turn(state.q)),
         t=turn(state.t),
         use=state.use & ~alone,
-        out=state.out + jnp.sum(alone.astype(state.out.dtype)),
-        ended=state.ended | (number != 1),
+        out=state.out + goes_on.astype(state.out.dtype),
+        ended=state.ended | ~goes_on,
         accepted=jnp.where(state.ended, state.accepted, number == 0),
     )
     return following, named

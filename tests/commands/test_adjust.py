@@ -3,9 +3,10 @@
 import json
 from dataclasses import replace
 
+import gemael
 import numpy as np
 import pytest
-from command_line import run, words
+from command_line import rows, run, words
 
 from jaxro.commands.adjust import Options, calculate
 from jaxro.statistics.promise import repeat_job
@@ -181,6 +182,47 @@ def test_bad_tables_say_where(network, said, tmp_path):
     told = run("adjust", tmp_path / "network.csv", "--out", tmp_path / "out")
     assert told.exit_code == 2 and said in words(told.output), told.output
     assert not (tmp_path / "out").exists()
+
+
+def compare(folder, *options):
+    lines, points = gemael.as_tables()
+    (folder / "network.csv").write_text(lines)
+    (folder / "points.csv").write_text(points)
+    known = "--points", folder / "points.csv"
+    return run("compare", folder / "network.csv", *known, *options)
+
+
+def test_procedures_are_compared_on_a_network(tmp_path):
+    out = tmp_path / "scores.csv"
+    asked = ("--procedure", "named-sets", "--procedure", "data-snooping")
+    settings = ("--errors", "0,1", "--size", "8", "--trials", "100", "--out", out)
+    told = compare(tmp_path, *asked, *settings)
+    assert told.exit_code == 0, told.output
+    assert "16 measurements, 100 networks a row" in words(told.stdout)
+    found = rows(out)
+    assert [row["procedure"] for row in found] == ["named-sets", "data-snooping"] * 2
+    assert [row["errors"] for row in found] == ["0", "0", "1", "1"]
+    shares = [float(row["noticed"]) for row in found]
+    assert shares[0] == shares[1] < 0.2 < 0.8 < shares[2] == shares[3]
+    assert found[0]["found"] == "" and float(found[2]["exactly_se"]) > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (
+            ("--procedure", "ransac"),
+            "--procedure: found 'ransac'; expected of a network",
+        ),
+        (("--errors", "6"), "--errors: found 6; expected less than the 6 degrees"),
+        (("--false-alarms", "0"), "--false-alarms: found 0.0"),
+        (("--plot", "a.png"), "--plot: found it with a network"),
+        (("--focal", "100"), "a network has no camera"),
+    ],
+)
+def test_what_a_comparison_of_networks_has_not(options, said, tmp_path):
+    told = compare(tmp_path, *options)
+    assert told.exit_code == 2 and said in words(told.output), told.output
 
 
 @pytest.mark.slow

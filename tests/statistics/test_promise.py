@@ -6,6 +6,7 @@ import functools
 import jax
 import numpy as np
 import pytest
+from gemael import rows_of_net
 from scipy import stats
 
 from jaxro.statistics.familywise import largest_tau, largest_w
@@ -13,39 +14,12 @@ from jaxro.statistics.promise import promise, repeat_job
 from jaxro.statistics.rows import Rows, normalise_rows
 from jaxro.xla.programs import compiled
 
-LEGS = """\
-1 0 72
-1 0 40
-1 2 44
-2 3 20
-0 3 61
-4 2 26
-4 5 59
-5 3 60
-6 4 83
-6 7 26
-5 7 74
-6 8 248
-8 9 111
-7 9 67
-8 10 108
-10 9 147
-"""
-"""A net of levelling (Gemael) with variances in mm²; the height of the point 0 is known."""
-
 LEVEL, DOUBT, ROUNDS = 0.05, 0.01, 3
 
 
 @pytest.fixture(scope="module")
 def given():
-    legs = [[float(v) for v in line.split()] for line in LEGS.splitlines()]
-    design = np.zeros((len(legs), 11))
-    for k, (a, b, variance) in enumerate(legs):
-        design[k, int(a)] -= 1 / np.sqrt(variance)
-        design[k, int(b)] += 1 / np.sqrt(variance)
-    design[:, 0] = 0
-    n = len(legs)
-    return Rows(np.zeros(n), design, np.ones(n, bool), np.zeros(n, int), np.arange(n))
+    return rows_of_net()
 
 
 class Job:

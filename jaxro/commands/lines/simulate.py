@@ -15,7 +15,7 @@ def compare(
         Path | None,
         given.file(
             "Its first pair is the layout; without it 16 points in eight rows, and 8 "
-            "points."
+            "points. Or a network of `jaxro adjust`."
         ),
     ] = None,
     procedure: Annotated[
@@ -47,6 +47,15 @@ def compare(
         ),
     ] = None,
     unit: given.Unit = "mm",
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            help="Points of a network.", metavar="POINTS.csv", show_default=False
+        ),
+    ] = None,
+    angles: Annotated[
+        str, typer.Option(help="Unit of the angles of a network.", metavar="UNIT")
+    ] = "degrees",
     out: Annotated[
         Path | None,
         typer.Option(
@@ -66,11 +75,13 @@ def compare(
     ] = None,
     force: given.ForceFile = False,
 ) -> None:
-    """Compare procedures for wrong points by simulation.
+    """Compare procedures for wrong points, or wrong measurements, by simulation.
 
     On the layout of FILE: what each finds of the errors planted, and what it costs in
-    good points. Exit code 0: done; 2: bad input, nothing written.
+    good points. Of a network: false alarms, what is noticed, named, found exactly.
+    Exit code 0: done; 2: bad input, nothing written.
     """
+    from ..network_input import is_network
     from ..request import Options
     from ..simulate import Wanted, run_comparison
 
@@ -95,7 +106,24 @@ def compare(
         plot=plot,
         force=force,
     )
-    end(lambda: run_comparison(options, wanted))
+    if not is_network(file):
+        if points is not None:
+            raise typer.BadParameter(
+                "--points belongs to a network: from,to,value,sigma"
+            )
+        end(lambda: run_comparison(options, wanted))
+        return
+    from ..adjust import Options as OfNetwork
+    from ..compare_network import run_network
+
+    of_photos = (camera, focal, principal_point, pixel_size, y_down or None)
+    if any(value is not None for value in of_photos):
+        raise typer.BadParameter("a network has no camera: leave out its options")
+    deviation = None if sigma is None else float(sigma)
+    of_network = OfNetwork(
+        file=file, points=points, angles=angles, sigma=deviation, level=false_alarms
+    )
+    end(lambda: run_network(of_network, wanted))
 
 
 def reproduce(
