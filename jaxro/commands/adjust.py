@@ -21,6 +21,7 @@ class Options:
 
     file: Path | None = None
     points: Path | None = None
+    covariances: Path | None = None
     sigma: float | None = None
     sigma0_unknown: bool = False
     level: float = 0.05
@@ -38,14 +39,14 @@ def run(options: Options) -> bool:
     """Read, adjust, show, write. True if the numbers may be used. Raises TableError, with
     nothing written."""
     console, _ = consoles()
-    read = options.file, options.points
-    inputs, texts = whole.Inputs(*read), {}
+    read_files = options.file, options.points, options.covariances
+    inputs, texts = whole.Inputs(*read_files), {}
     with whole.claim(options.out, whole.check_target, options.force):
         done = calculate(options)
         if options.out is not None:
             texts = contents(done)
             inputs.check()
-            whole.write(options.out, texts, read)
+            whole.write(options.out, texts, read_files)
     if options.json:
         show_json(summary(done))
         return done.usable
@@ -67,6 +68,7 @@ def calculate(options: Options) -> Done:
     given = read(
         options.file,
         options.points,
+        covariances=options.covariances,
         sigma=options.sigma,
         angles=options.angles,
         unit=options.unit,
@@ -108,15 +110,18 @@ def _check(options: Options) -> None:
         raise TableError(
             "--angles", found=repr(options.angles), expected=", ".join(ANGLES)
         )
-    if options.file is None and options.points is not None:
-        raise TableError(
-            "--points",
-            found="it without NETWORK.csv",
-            expected="the network that they belong to",
-        )
+    tables = {"--points": options.points, "--covariances": options.covariances}
+    for option, table in tables.items():
+        if options.file is None and table is not None:
+            raise TableError(
+                option,
+                found="it without NETWORK.csv",
+                expected="the network that they belong to",
+            )
     if options.file is not None and options.file.suffix.lower() in XML:
         said = {
             "--points": options.points is not None,
+            "--covariances": options.covariances is not None,
             "--sigma": options.sigma is not None,
             "--angles": options.angles != "degrees",
         }
@@ -134,7 +139,8 @@ def _check_promise(options: Options, lines: list[Measurement]) -> None:
     if several:
         raise TableError(
             "--promise",
-            found=f"it with a {several[0].kind} (line {several[0].line})",
+            found=f"it with several numbers together: {several[0].kind}, line "
+            f"{several[0].line}",
             expected="a network whose measurements are single numbers",
         )
     if not 0 <= options.wrong < len(lines):

@@ -1,5 +1,6 @@
 """What is read of a network, and the network that is made of it."""
 
+import itertools
 import math
 import re
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,7 @@ from ..reports.network_files import AXES
 from ..surveys.approximate import complete
 from ..surveys.geodetic import KINDS, Measured, Network
 from ..tables import gama, ground as ground_tables, network as tables
+from ..tables.covariances import Covariance, read as read_covariances
 from ..tables.examples import network as example
 from ..tables.fields import TableError
 from ..tables.ground import GroundPoints
@@ -20,8 +22,17 @@ from ..tables.network import Measurement
 ANGLES = {"degrees": math.pi / 180, "gon": math.pi / 200, "radians": 1.0}
 """Radians of a unit of angles."""
 
-LINEAR = ("height", "vector", "position", *AXES)
+LINEAR = ("height", "vector", "position", "plan", *AXES)
 """Kinds that need no approximate coordinates."""
+
+OF_AXES = {
+    (True, False, False): "X",
+    (False, True, False): "Y",
+    (False, False, True): "Z",
+    (True, True, False): "plan",
+    (True, True, True): "position",
+}
+"""Kinds by the coordinates that are known."""
 
 XML = (".xml", ".gkf")
 """Ends of the names of files of GNU Gama."""
@@ -60,6 +71,7 @@ def read(
     file: Path | None,
     points: Path | None,
     *,
+    covariances: Path | None = None,
     sigma: float | None,
     angles: str,
     unit: str,
@@ -76,7 +88,8 @@ def read(
         ground = None if points is None else ground_tables.read(points)
         title = str(file)
     lines = [_in_radians(line, ANGLES[angles]) for line in lines]
-    lines += _known_with_deviations(ground)
+    entries = [] if covariances is None else read_covariances(covariances)
+    lines += _known_with_deviations(ground, entries)
     relative = any(line.is_relative for line in lines)
     return Given(title, unit, angles, lines, ground, not relative)
 
@@ -105,24 +118,95 @@ def _in_radians(line: Measurement, unit: float) -> Measurement:
     return replace(line, values=line.values * unit, root=line.root * unit)
 
 
-def _known_with_deviations(ground: GroundPoints | None) -> list[Measurement]:
-    """Control coordinates with standard deviations, as measurements."""
+def _known_with_deviations(
+    ground: GroundPoints | None, entries: list[Covariance]
+) -> list[Measurement]:
+    """Control coordinates with standard deviations, as measurements: those of a point
+    one by one, all of the points that have covariances together."""
     if ground is None or ground.deviations is None:
+        if entries:
+            raise entries[0].row.error(
+                "point",
+                found="covariances of points without deviations",
+                expected="a table --points with sX,sY,sZ or sigma",
+            )
         return []
+    known = ground.is_a("control")[:, None] & ground.known & (ground.deviations > 0)
+    together = {name for entry in entries for name, _ in (entry.one, entry.other)}
     found = []
-    for k in np.flatnonzero(ground.is_a("control")):
-        for axis, value, sigma in zip(
-            AXES, ground.coordinates[k], ground.deviations[k], strict=True
-        ):
-            if np.isfinite(value) and sigma > 0:
-                root = np.array([[sigma]])
-                line = int(ground.lines[k])
-                found.append(
-                    Measurement(
-                        axis, (ground.names[k],), np.array([value]), root, "", line
-                    )
+    for k, axis in np.argwhere(known):
+        if ground.names[k] not in together:
+            value, sigma = ground.coordinates[k, axis], ground.deviations[k, axis]
+            found.append(
+                Measurement(
+                    kind=AXES[axis],
+                    points=(ground.names[k],),
+                    values=np.array([value]),
+                    root=np.array([[sigma]]),
+                    set="",
+                    line=int(ground.lines[k]),
                 )
+            )
+    if entries:
+        found.append(_known_together(ground, known, entries, together))
     return found
+
+
+def _known_together(
+    ground: GroundPoints,
+    known: Bool[np.ndarray, "point 3"],
+    entries: list[Covariance],
+    together: set[str],
+) -> Measurement:
+    """The coordinates of several points with one covariance matrix. Raises
+    TableError."""
+    assert ground.deviations is not None
+    points = [k for k, name in enumerate(ground.names) if name in together]
+    places = {
+        (ground.names[k], int(axis)): place
+        for place, (k, axis) in enumerate(
+            (k, axis) for k in points for axis in np.flatnonzero(known[k])
+        )
+    }
+    for entry in entries:
+        for column, coordinate in zip(
+            ("point", "other"), (entry.one, entry.other), strict=True
+        ):
+            if coordinate not in places:
+                name, axis = coordinate
+                raise entry.row.error(
+                    column,
+                    found=f"{name!r}, whose {AXES[axis]} is not known with a deviation",
+                    expected="control points of --points with coordinates and deviations",
+                )
+    kind = OF_AXES.get(tuple(known[points[0]].tolist()))
+    if kind is None or np.any(known[points] != known[points[0]]):
+        raise entries[0].row.error(
+            "point",
+            found="points that are known in different coordinates",
+            expected="X,Y,Z of all of them, X,Y of all, or one coordinate of all",
+        )
+    own = known[points]
+    matrix = np.diag(ground.deviations[points][own] ** 2)
+    for entry in entries:
+        i, j = places[entry.one], places[entry.other]
+        matrix[i, j] = matrix[j, i] = entry.value
+    try:
+        root = np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        raise entries[0].row.error(
+            "point",
+            found="a covariance matrix that is not positive",
+            expected="covariances smaller than the products of the standard deviations",
+        ) from None
+    return Measurement(
+        kind=kind,
+        points=tuple(ground.names[k] for k in points),
+        values=ground.coordinates[points][own],
+        root=root,
+        set="",
+        line=int(ground.lines[points[0]]),
+    )
 
 
 def assemble(given: Given, names: list[str]) -> tuple[Network, list[Measurement]]:
@@ -137,8 +221,10 @@ def assemble(given: Given, names: list[str]) -> tuple[Network, list[Measurement]
         )
     }
     measured, ordered = [], []
-    for kind in KINDS:
-        own = [line for line in lines if line.kind == kind]
+    # those with one covariance matrix are of a part of their own, by their size
+    sizes = sorted({len(line.points) for line in lines})
+    for kind, size in itertools.product(KINDS, sizes):
+        own = [line for line in lines if (line.kind, len(line.points)) == (kind, size)]
         if not own:
             continue
         ordered += own

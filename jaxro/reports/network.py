@@ -106,7 +106,10 @@ def _promise(done: Done) -> list[str]:
 
 def _name(done: Done, k: int) -> str:
     line = done.lines[k]
-    return f"{line.kind} {'-'.join(line.points)}"
+    points = line.points
+    if len(points) > 3:
+        points = (*points[:3], "...")
+    return f"{line.kind} {'-'.join(points)}"
 
 
 def _fit(done: Done) -> str:

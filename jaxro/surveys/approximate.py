@@ -7,11 +7,12 @@ The first way to a point is taken; an adjustment needs no more.
 
 import itertools
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from .geodetic import Measured
+from .geodetic import KINDS, Measured
 
 FLAT = 0.05
 """Sine of the angle between two directions below which they do not cut."""
@@ -30,25 +31,46 @@ def complete(at: Coordinates, measured: Sequence[Measured]) -> Coordinates:
     return at
 
 
-def _each(
-    measured: Sequence[Measured], *kinds: str
-) -> Iterator[tuple[Measured, int, np.ndarray]]:
-    """The measurements of some kinds: their part, their number in it, their points."""
+class _Single(NamedTuple):
+    """One measurement: its kind, points and numbers, the heights of instrument and
+    targets, and its set."""
+
+    kind: str
+    at: Int[np.ndarray, " ends"]
+    values: Float[np.ndarray, " m"]
+    above: Float[np.ndarray, " ends"]
+    set: int | None
+
+
+def _each(measured: Sequence[Measured], *kinds: str) -> Iterator[_Single]:
+    """The measurements of some kinds, one by one."""
     for part in measured:
-        if part.kind in kinds:
-            yield from ((part, k, ends) for k, ends in enumerate(part.at))
+        if part.kind not in kinds:
+            continue
+        kind = KINDS[part.kind]
+        above = np.zeros(part.at.shape) if part.above is None else part.above
+        for k, points in enumerate(part.at):
+            ends = points.reshape(-1, kind.ends)
+            own = zip(
+                ends,
+                part.values[k].reshape(len(ends), -1),
+                above[k].reshape(ends.shape),
+                strict=True,
+            )
+            number = None if part.set is None else int(part.set[k])
+            yield from (_Single(part.kind, *one, number) for one in own)
 
 
 def _complete_heights(at: Coordinates, measured: Sequence[Measured]) -> None:
     """Differences of heights, vectors and zenith angles, from either end."""
-    for part, k, (a, b) in _each(measured, "height", "vector", "zenith"):
-        axes = [2] if part.kind != "vector" else [0, 1, 2]
-        above = np.zeros(2) if part.above is None else part.above[k]
-        rise = part.values[k].copy()
-        if part.kind == "zenith":
+    for one in _each(measured, "height", "vector", "zenith"):
+        a, b = one.at
+        axes = [2] if one.kind != "vector" else [0, 1, 2]
+        rise = one.values.copy()
+        if one.kind == "zenith":
             plan = np.hypot(*(at[b] - at[a])[:2])
             rise = plan / np.tan(rise)
-        rise[-1] += above[0] - above[1]
+        rise[-1] += one.above[0] - one.above[1]
         for axis, step in zip(axes, rise, strict=True):
             if np.isnan(at[b, axis]):
                 at[b, axis] = at[a, axis] + step
@@ -75,13 +97,13 @@ def _lengths(measured: Sequence[Measured]) -> dict[frozenset[int], float]:
     """Distances in plan between points; of slope distances by the zenith angle of their
     line, where there is one."""
     zeniths = {
-        frozenset(ends.tolist()): float(part.values[k, 0])
-        for part, k, ends in _each(measured, "zenith")
+        frozenset(one.at.tolist()): float(one.values[0])
+        for one in _each(measured, "zenith")
     }
     found = {}
-    for part, k, ends in _each(measured, "slope", "distance"):
-        line, length = frozenset(ends.tolist()), float(part.values[k, 0])
-        if part.kind == "slope":
+    for one in _each(measured, "slope", "distance"):
+        line, length = frozenset(one.at.tolist()), float(one.values[0])
+        if one.kind == "slope":
             length *= abs(np.sin(zeniths.get(line, np.pi / 2)))
         found[line] = length
     return found
@@ -93,20 +115,19 @@ def _rays(
     """From known points a to others b: a, b and t(a, b)."""
     known = lambda *points: not np.any(np.isnan(at[list(points), :2]))
     towards = lambda a, b: float(np.arctan2(*(at[b] - at[a])[1::-1]))
-    turns: dict[int, float] = {}
-    sights = list(_each(measured, "direction"))
-    for part, k, (a, b) in sights:
-        if part.set is not None and known(a, b):
-            turns.setdefault(int(part.set[k]), towards(a, b) - float(part.values[k, 0]))
-    for part, k, (a, b) in sights:
-        if part.set is not None and known(a) and int(part.set[k]) in turns:
-            yield int(a), int(b), turns[int(part.set[k])] + float(part.values[k, 0])
-    for part, k, (a, b) in _each(measured, "azimuth"):
-        if known(a):
-            yield int(a), int(b), float(part.values[k, 0])
-    for part, k, (a, b, c) in _each(measured, "angle"):
-        angle = float(part.values[k, 0])
+    turns: dict[int | None, float] = {}
+    sights = [one for one in _each(measured, "direction") if one.set is not None]
+    for _, (a, b), (value,), _, number in sights:
         if known(a, b):
-            yield int(a), int(c), towards(a, b) + angle
+            turns.setdefault(number, towards(a, b) - value)
+    for _, (a, b), (value,), _, number in sights:
+        if known(a) and number in turns:
+            yield int(a), int(b), turns[number] + value
+    for _, (a, b), (value,), *_ in _each(measured, "azimuth"):
+        if known(a):
+            yield int(a), int(b), value
+    for _, (a, b, c), (value,), *_ in _each(measured, "angle"):
+        if known(a, b):
+            yield int(a), int(c), towards(a, b) + value
         elif known(a, c):
-            yield int(a), int(b), towards(a, c) - angle
+            yield int(a), int(b), towards(a, c) - value

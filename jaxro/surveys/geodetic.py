@@ -41,8 +41,9 @@ STILL = 1e-6
 
 
 class Measured(NamedTuple):
-    """Measurements of one kind: the numbers of the points of each (`at`; two or three,
-    as the kind has), what was measured, and the lower triangle of the Cholesky factor
+    """Measurements of one kind: the numbers of the points of each (`at`; as many as the
+    kind has, or several times as many: several measurements with one covariance
+    matrix), what was measured, and the lower triangle of the Cholesky factor
     of its covariance matrix (a standard deviation, of one number). `set`: of a
     direction the number of its set. `above`: the heights of instrument and targets above
     the points; zero, if None."""
@@ -137,7 +138,7 @@ class Network(NamedTuple):
         found = self.held.copy()
         for part in self.measured:
             if KINDS[part.kind].ends == 1:
-                found[part.at[:, 0]] |= KINDS[part.kind].touches
+                found[part.at.ravel()] |= KINDS[part.kind].touches
         return found & self.touched
 
     @property
@@ -229,9 +230,14 @@ class _Condition(eqx.Module):
     def __call__(self, *given: Array | tuple[Array, ...]) -> Float[Array, " m"]:
         *blocks, (white, values, root, above) = given
         kind = KINDS[self.kind]
-        up = jnp.zeros((kind.ends, 3)).at[:, 2].set(above)
-        ends = [a + height for a, height in zip(blocks[: kind.ends], up, strict=True)]
-        off = kind.function(*ends, *blocks[kind.ends :]) - values
+        count = len(blocks) - kind.has_set
+        up = jnp.zeros((count, 3)).at[:, 2].set(above)
+        ends = [a + height for a, height in zip(blocks[:count], up, strict=True)]
+        found = [
+            kind.function(*ends[begin : begin + kind.ends], *blocks[count:])
+            for begin in range(0, count, kind.ends)
+        ]
+        off = jnp.concatenate(found) - values
         if kind.is_angle:
             # the nearest of all full turns, which no derivative sees
             off = off - 2 * jnp.pi * jnp.round(off / (2 * jnp.pi))
@@ -239,7 +245,7 @@ class _Condition(eqx.Module):
 
 
 def _term(part: Measured) -> Term:
-    touches = [("point", part.at[:, end]) for end in range(KINDS[part.kind].ends)]
+    touches = [("point", part.at[:, end]) for end in range(part.at.shape[1])]
     if part.set is not None:
         touches.append(("orientation", part.set))
     white = np.zeros(part.values.shape)

@@ -4,8 +4,9 @@ that names line and element.
 Read are points, sets of directions, distances, angles, azimuths, slope distances, zenith
 angles, height differences, vectors and observed coordinates, with heights of instrument
 and targets. Angles are gons, or degrees as 57-32-28.4; deviations are mm and cc (of
-degrees seconds). What has another meaning than here is an error: correlations between
-measurements, points that are neither fixed nor adjusted. What says only how gama-local
+degrees seconds). Measurements of one kind with covariances between them are one of
+several numbers. What has another meaning than here is an error: covariances between
+kinds, points that are neither fixed nor adjusted. What says only how gama-local
 computes and writes (`gama_elements.OF_GAMA`) has no effect.
 """
 
@@ -236,6 +237,8 @@ class _Reader:
                 matrices.append(element)
             else:
                 members += [(element, found) for found in one(cluster, element)]
+        if len(matrices) > 1:
+            raise matrices[1].error("a second <cov-mat>", "one for all")
         if matrices and len(members) > MOST_TOGETHER:
             raise matrices[0].error(
                 f"a <cov-mat> of {len(members)} measurements",
@@ -244,23 +247,16 @@ class _Reader:
         scales = np.array([scale for _, found in members for scale in found.scales])
         matrix = None
         if matrices:
-            matrix = _matrix(matrices[-1], len(scales)) * np.outer(scales, scales)
-        begin = 0
+            matrix = _matrix(matrices[0], len(scales)) * np.outer(scales, scales)
         for element, found in members:
+            self._check_points(element, found)
+        begin = 0
+        for element, found in self._together(members, matrix, matrices):
             own = slice(begin, begin := begin + len(found.values))
             if matrix is None:
                 root = np.array([[self._deviation(element, found)]])
             else:
-                outside = matrix[own].copy()
-                outside[:, own] = 0
-                if np.any(outside):
-                    raise matrices[-1].error(
-                        "covariances between measurements",
-                        "a <cov-mat> without them: measurements are adjusted as "
-                        "independent ones, vectors with the matrix of each",
-                    )
-                root = _root(matrices[-1], matrix[own, own])
-            self._check_points(element, found)
+                root = _root(matrices[0], matrix[own, own])
             self.lines.append(
                 Measurement(
                     found.kind,
@@ -272,6 +268,42 @@ class _Reader:
                     above=found.above,
                 )
             )
+
+    def _together(
+        self,
+        members: list[tuple[Element, _Found]],
+        matrix: Float[np.ndarray, "n n"] | None,
+        matrices: list[Element],
+    ) -> list[tuple[Element, _Found]]:
+        """The members as they are, or as one measurement where their covariance matrix
+        is not that of each."""
+        ends = np.cumsum([len(found.values) for _, found in members])
+        member = np.searchsorted(ends, np.arange(ends[-1] if members else 0), "right")
+        if matrix is None or not np.any(matrix[member[:, None] != member[None, :]]):
+            return members
+        kinds = {found.kind for _, found in members}
+        if len(kinds) > 1:
+            raise matrices[0].error(
+                f"covariances between measurements of {', '.join(sorted(kinds))}",
+                "covariances within one kind",
+            )
+        found = [one for _, one in members]
+        return [
+            (
+                members[0][0],
+                _Found(
+                    found[0].kind,
+                    tuple(name for one in found for name in one.points),
+                    [value for one in found for value in one.values],
+                    [scale for one in found for scale in one.scales],
+                    tuple(
+                        height
+                        for one in found
+                        for height in one.above or (0.0,) * len(one.points)
+                    ),
+                ),
+            )
+        ]
 
     def _sight(self, cluster: Element, element: Element) -> list[_Found]:
         kind, default = MEASURED[element.name]

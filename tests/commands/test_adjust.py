@@ -154,7 +154,9 @@ def test_a_promise_of_vectors_is_refused(tmp_path):
     (tmp_path / "network.csv").write_text("from,to,dX,dY,dZ,sigma\na,b,1,2,3,1\n")
     told = run("adjust", tmp_path / "network.csv", "--promise", "100")
     assert told.exit_code == 2
-    assert "--promise: found it with a vector (line 2)" in words(told.output)
+    assert "--promise: found it with several numbers together: vector, line 2" in words(
+        told.output
+    )
 
 
 @pytest.mark.parametrize(
@@ -251,3 +253,30 @@ def test_the_simulated_job_is_that_of_the_program():
         same += np.flatnonzero(found.named[k]).tolist() == again.wrong
     assert same >= count - 1
     assert 0.2 * count < np.sum(np.sum(found.named, axis=1) == 1) < count
+
+
+KNOWN = (
+    "point,X,Y,Z,sX,sY,sZ\na,,,1,0,0,.1\nb,,,2,0,0,.1\nc,5,6,3,.1,.1,.1\nd,,,4,0,0,0\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("covariances", "said"),
+    [
+        ("a,b,zz,0.001\n", "line 2: found"),
+        ("a,e,0.001\n", "line 2, column other: found 'e', whose Z is not known"),
+        ("a,d,0.001\n", "found 'd', whose Z is not known with a deviation"),
+        ("a,a,0.001\n", "found the variance of a coordinate"),
+        ("a,b,0.001\nb,a,0.001\n", "this covariance again (first on line 2)"),
+        ("a,c,0.001\n", "points that are known in different coordinates"),
+        ("a,b,0.02\n", "a covariance matrix that is not positive"),
+    ],
+)
+def test_bad_covariances_say_where(covariances, said, tmp_path):
+    (tmp_path / "net.csv").write_text("from,to,difference,sigma\na,b,1,0.1\n")
+    (tmp_path / "points.csv").write_text(KNOWN)
+    (tmp_path / "covariances.csv").write_text("point,other,cZZ\n" + covariances)
+    tables = "--points", tmp_path / "points.csv"
+    tables += "--covariances", tmp_path / "covariances.csv"
+    told = run("adjust", tmp_path / "net.csv", *tables)
+    assert told.exit_code == 2 and said in words(told.output), told.output

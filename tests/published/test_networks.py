@@ -174,6 +174,35 @@ def test_the_printed_coordinates_and_deviations(name, tmp_path):
         np.testing.assert_allclose(spread, there, 0, 0.5001e-3)
 
 
+def test_known_heights_with_a_covariance_matrix(tmp_path):
+    """The dynamic net of F. Krumm, example 2.3: heights, deviations and residuals, mm."""
+    legs = "2,8,5.128,700 3,6,2.183,500 3,7,12.254,500 6,7,10.071,800 8,7,2.824,800"
+    lines = [leg.split(",") for leg in legs.split()]
+    (tmp_path / "network.csv").write_text(
+        "from,to,difference,sigma\n"
+        + "".join(f"{a},{b},{v},{np.sqrt(float(s) / 1000)}\n" for a, b, v, s in lines)
+    )
+    (tmp_path / "points.csv").write_text(
+        "point,Z,sigma\n2,107.7541,.05\n3,103.4535,.06\n"
+    )
+    (tmp_path / "covariances.csv").write_text("point,other,cZZ\n3,2,-0.0015\n")
+    tables = "--points", tmp_path / "points.csv"
+    tables += "--covariances", tmp_path / "covariances.csv"
+    told = run(
+        "adjust", tmp_path / "network.csv", *tables, "--unknown-sigma0", "--json"
+    )
+    found = json.loads(told.stdout)
+    heights = [found["points"][name]["coordinates"][2] for name in "23678"]
+    printed = [107.7541, 103.4535, 105.6364, 115.7072, 112.8826]
+    np.testing.assert_allclose(heights, printed, 0, 0.5001e-4)
+    spread = [1000 * found["points"][name]["deviations"][2] for name in "23678"]
+    np.testing.assert_allclose(spread, [0.04, 0.04, 0.43, 0.39, 0.48], 0, 0.005001)
+    residuals = [1000 * float(row["residual"]) for row in found["measurements"][:5]]
+    printed = [0.52, -0.10, -0.27, -0.17, 0.60]
+    np.testing.assert_allclose(residuals, printed, 0, 0.005001)
+    assert found["measurements"][5]["points"] == "2-3"
+
+
 @pytest.mark.slow
 def test_axes_the_wrong_way_round_are_no_solution(tmp_path):
     told = adjust(tmp_path, "Wolf, free", "point,X,Y,role")

@@ -195,3 +195,35 @@ def test_a_vector_is_tested_as_a_whole(measured):
         + jax.scipy.special.erfc(np.sqrt(tested.statistic[0] / 2)),
         rtol=1e-6,
     )
+
+
+def test_vectors_with_one_covariance_matrix():
+    """Two vectors that were measured together, and a third: least squares with all
+    weights."""
+    rng = np.random.default_rng(2)
+    a = rng.normal(size=(6, 6))
+    together = a @ a.T + np.eye(6)
+    values = rng.normal(size=9)
+    measured = (
+        Measured(
+            "vector",
+            np.array([[0, 1, 1, 2]]),
+            values[None, :6],
+            np.linalg.cholesky(together)[None],
+        ),
+        Measured("vector", np.array([[0, 2]]), values[None, 6:], np.eye(3)[None]),
+    )
+    held = np.zeros((3, 3), bool)
+    held[0] = True
+    found = adjust_network(Network(np.zeros((3, 3)), held, measured))
+    one, none = np.eye(3), np.zeros((3, 3))
+    design = np.block([[one, none], [-one, one], [none, one]])
+    weights = np.linalg.inv(
+        np.block([[together, np.zeros((6, 3))], [np.zeros((3, 6)), one]])
+    )
+    cofactor = np.linalg.inv(design.T @ weights @ design)
+    wanted = cofactor @ design.T @ weights @ values
+    np.testing.assert_allclose(found.coordinates[1:].ravel(), wanted, atol=1e-9)
+    blocks = np.asarray(found.adjusted.cofactors("point"))[1:]
+    np.testing.assert_allclose(blocks[0], cofactor[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(blocks[1], cofactor[3:, 3:], atol=1e-9)

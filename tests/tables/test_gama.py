@@ -138,6 +138,13 @@ def test_units_and_deviations_of_all():
     assert {line.set for line in found.lines[:2]} == {found.lines[0].set}
 
 
+def test_covariances_within_a_kind_make_one_measurement():
+    text = document(TWO.format('<cov-mat dim="2" band="1">4 1 9</cov-mat>'))
+    (line,) = gama.parse(text, "net.gkf").lines
+    assert line.points == ("A", "B", "A", "C") and line.values.tolist() == [1, 1]
+    np.testing.assert_allclose(line.root @ line.root.T, [[4e-6, 1e-6], [1e-6, 9e-6]])
+
+
 SIGHT = '<obs from="A"><distance to="B" val="1" stdev="1"/></obs>'
 LAUGHS = """<!DOCTYPE lolz [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]>
 <gama-local><network><description>&b;</description></network></gama-local>"""
@@ -174,8 +181,16 @@ TWO = '<obs from="A"><distance to="B" val="1"/><distance to="C" val="1"/>{}</obs
         (document(SIGHT, POINTS * 2), "a second time (first on line 2)"),
         (document(TWO.format("")), "without a standard deviation"),
         (
-            document(TWO.format('<cov-mat dim="2" band="1">1 0.5 1</cov-mat>')),
-            "covariances between measurements",
+            document(
+                TWO.format('<cov-mat dim="2" band="1">1 0.5 1</cov-mat>').replace(
+                    '<distance to="B"', '<azimuth to="B"'
+                )
+            ),
+            "covariances between measurements of azimuth, distance",
+        ),
+        (
+            document(TWO.format('<cov-mat dim="2" band="0">1 1</cov-mat>' * 2)),
+            "a second",
         ),
         (
             document(TWO.format('<cov-mat dim="2" band="0">1 -1</cov-mat>')),

@@ -30,6 +30,15 @@ Points = Annotated[
         show_default=False,
     ),
 ]
+Covariances = Annotated[
+    Path | None,
+    typer.Option(
+        help="CSV table of covariances between coordinates that are known with "
+        "deviations: point,other and cXX ... cZZ.",
+        metavar="COVARIANCES.csv",
+        show_default=False,
+    ),
+]
 Sigma = Annotated[
     float | None,
     typer.Option(
@@ -91,6 +100,7 @@ Size = Annotated[
 def adjust(
     file: File = None,
     points: Points = None,
+    covariances: Covariances = None,
     sigma: Sigma = None,
     sigma0_unknown: Unknown = False,
     level: Level = 0.05,
@@ -114,6 +124,7 @@ def adjust(
     options = Options(
         file=file,
         points=points,
+        covariances=covariances,
         sigma=sigma,
         sigma0_unknown=sigma0_unknown,
         level=level,
