@@ -111,6 +111,7 @@ class _Reader:
         self.defaults: dict[str, str] = {}
         self.points: dict[str, _Status] = {}
         self.lines: list[Measurement] = []
+        self.clusters = 0
 
     def network(self, document: Element) -> Gama:
         """What the document says."""
@@ -231,6 +232,7 @@ class _Reader:
 
     def _read_cluster(self, cluster: Element, one: Callable) -> None:
         """The measurements of a cluster with their covariance matrix, if it has one."""
+        self.clusters += 1
         members, matrices = [], []
         for element in cluster.children:
             if element.name == "cov-mat":
@@ -263,7 +265,7 @@ class _Reader:
                     found.points,
                     np.array(found.values),
                     root,
-                    f"<obs> of line {cluster.line}",
+                    f"<obs> {self.clusters}",
                     element.line,
                     above=found.above,
                 )

@@ -138,6 +138,12 @@ def test_units_and_deviations_of_all():
     assert {line.set for line in found.lines[:2]} == {found.lines[0].set}
 
 
+def test_every_obs_is_a_set_even_on_one_line():
+    one = '<obs from="A"><direction to="B" val="1" stdev="1"/></obs>'
+    first, second = gama.parse(document(one + one), "net.gkf").lines
+    assert first.set != second.set
+
+
 def test_covariances_within_a_kind_make_one_measurement():
     text = document(TWO.format('<cov-mat dim="2" band="1">4 1 9</cov-mat>'))
     (line,) = gama.parse(text, "net.gkf").lines
