@@ -81,8 +81,10 @@ def _verdict(done: Done) -> str:
 def _promise(done: Done) -> list[str]:
     """What verdicts and intervals are worth, by simulation."""
     told, asked = done.promise, done.simulated
-    if told is None or asked is None:
+    if asked is None:
         return []
+    if told is None:
+        return ["Nothing is simulated: no measurement is checked by others."]
     percent = lambda share: "-" if np.isnan(share) else f"{share:.1%}"
     intervals = told.reported if done.sigma_known else told.estimated
     held = f"{percent(np.min(intervals))} to {percent(np.max(intervals))}"

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from ..surveys.geodetic import KINDS
 from . import fields
 from .gama_elements import Element, read_elements
+from .gama_numbers import MM, SECOND, angle, covariance_matrix, root_of
 from .ground import GroundPoints
 from .network import Measurement
 
@@ -30,13 +31,6 @@ MOST = 50_000_000
 MOST_TOGETHER = 3000
 """Measurements with one covariance matrix."""
 
-CC = 1e-4
-"""Gons."""
-SECOND = 1e-4 / 0.324
-"""Gons."""
-MM = 1e-3
-
-DEGREES = re.compile(r"([-+]?)(\d+)-(\d+)-(\d+(?:\.\d*)?)")
 STATUS = re.compile(r"(xy|XY)?(z|Z)?")
 
 MEASURED = {
@@ -249,7 +243,9 @@ class _Reader:
         scales = np.array([scale for _, found in members for scale in found.scales])
         matrix = None
         if matrices:
-            matrix = _matrix(matrices[0], len(scales)) * np.outer(scales, scales)
+            matrix = covariance_matrix(matrices[0], len(scales)) * np.outer(
+                scales, scales
+            )
         for element, found in members:
             self._check_points(element, found)
         begin = 0
@@ -258,7 +254,7 @@ class _Reader:
             if matrix is None:
                 root = np.array([[self._deviation(element, found)]])
             else:
-                root = _root(matrices[0], matrix[own, own])
+                root = root_of(matrices[0], matrix[own, own])
             self.lines.append(
                 Measurement(
                     found.kind,
@@ -317,8 +313,13 @@ class _Reader:
         heights = [element.number("from_dh", above)]
         heights += [element.number(f"{end}_dh", 0.0) for end in ends]
         if KINDS[kind].is_angle:
-            value, scale = _angle(element)
+            value, scale = angle(element)
             self.in_degrees |= scale == SECOND
+            if kind == "zenith" and not 0 < value < 200:
+                raise element.error(
+                    f"val={element.attributes['val']!r} of <z-angle>",
+                    "an angle from the vertical, between 0 and 200 gon",
+                )
             if kind != "zenith":
                 value *= self.turn
             if kind == "azimuth":
@@ -402,44 +403,3 @@ class _Reader:
                     f"it in fix or adj of its <point> on line {one.line}, or no "
                     "measurement of it",
                 )
-
-
-def _matrix(element: Element, count: int) -> Float[np.ndarray, "n n"]:
-    """A covariance matrix, whose upper band is written row by row."""
-    dim, band = (int(element.number(key)) for key in ("dim", "band"))
-    try:
-        numbers = [float(entry) for entry in element.text.split()]
-    except ValueError:
-        numbers = [np.nan]
-    places = [(i, j) for i in range(count) for j in range(i, min(i + band + 1, count))]
-    if dim != count or len(numbers) != len(places) or not np.all(np.isfinite(numbers)):
-        raise element.error(
-            f"a <cov-mat> of dim {dim}, band {band} with {len(numbers)} numbers",
-            f"dim {count}, the numbers measured before it, and {len(places)} finite "
-            "entries of the upper band",
-        )
-    matrix = np.zeros((count, count))
-    for (i, j), number in zip(places, numbers, strict=True):
-        matrix[i, j] = matrix[j, i] = number
-    return matrix
-
-
-def _root(
-    element: Element, matrix: Float[np.ndarray, "m m"]
-) -> Float[np.ndarray, "m m"]:
-    try:
-        return np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        raise element.error(
-            "a matrix that is not positive", "variances and covariances"
-        ) from None
-
-
-def _angle(element: Element) -> tuple[float, float]:
-    """An angle in gons, and the gons of the unit of its deviation."""
-    given = element.attributes.get("val", "").strip()
-    if match := DEGREES.fullmatch(given):
-        sign, degrees, minutes, seconds = match.groups()
-        size = float(degrees) + float(minutes) / 60 + float(seconds) / 3600
-        return (-size if sign == "-" else size) / 0.9, SECOND
-    return element.number("val"), CC

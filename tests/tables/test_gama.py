@@ -178,6 +178,19 @@ TWO = '<obs from="A"><distance to="B" val="1"/><distance to="C" val="1"/>{}</obs
         (document(SIGHT.replace('"B"', '"D"')), "the point 'D' without <point>"),
         (document(SIGHT.replace('val="1"', 'val="1,5"')), "val='1,5' of <distance>"),
         (document(SIGHT.replace('val="1"', "")), "<distance> without val"),
+        (
+            document(SIGHT.replace("distance", "z-angle").replace('"1"', '"301.5"', 1)),
+            "val='301.5' of <z-angle>",
+        ),
+        (
+            '<?xml version="1.0" encoding="iso-8859-2"?>' + document(SIGHT),
+            None,
+        ),
+        (document(SIGHT.replace('val="1"', 'val="1e999"')), "val='1e999'"),
+        (
+            document(SIGHT.replace('val="1"', 'val="&lol;"')),
+            "no XML (undefined entity)",
+        ),
         (document(SIGHT.replace(' from="A"', "")), "<obs> without from"),
         (document(SIGHT.replace('stdev="1"', 'stdev="0"')), "stdev=0 of <distance>"),
         (document(SIGHT, POINTS.replace("xyz", "xy")), None),
