@@ -25,7 +25,7 @@ BUDGET = {
     "laws": 400,
     "orientation": 850,
     "plots": 1100,
-    "published": 200,
+    "published": 250,
     "rejection": 1150,
     "reports": 900,
     "statistics": 400,

@@ -20,6 +20,7 @@ def given():
     return rows_of_net()
 
 
+@pytest.mark.slow
 def test_levels_and_the_scores_of_named_sets(given):
     """Without errors the level is that of every procedure; the scores of one that the
     promise simulates are its shares, by the same draws."""

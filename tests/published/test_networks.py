@@ -145,7 +145,6 @@ NETS = {
     "Wolf, free": (WOLF, WOLF_POINTS, WOLF_ADJUSTED, "gon"),
     "Ghilani": (ghilani(), GHILANI_POINTS, GHILANI_ADJUSTED, "degrees"),
 }
-FURTHER = [name for name in NETS if name != "Niemeier"]
 
 
 def adjust(folder, name, header="point,Y,X,role"):
@@ -160,9 +159,8 @@ def adjust(folder, name, header="point,Y,X,role"):
     return run("adjust", *tables, "--angles", angles, "--unknown-sigma0", "--json")
 
 
-@pytest.mark.parametrize(
-    "name", ["Niemeier", *(pytest.param(n, marks=pytest.mark.slow) for n in FURTHER)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NETS)
 def test_the_printed_coordinates_and_deviations(name, tmp_path):
     found = json.loads(adjust(tmp_path, name).stdout)["points"]
     for line in NETS[name][2].splitlines():
