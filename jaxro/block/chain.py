@@ -62,16 +62,21 @@ class Chained(NamedTuple):
     centres: Float[np.ndarray, "photo 3"]
 
 
-class Unjoined(ValueError):
-    """Photos that no common scale joins to the others; `photos` names them."""
+JOINING = (
+    "measure points that lie on three photos, two of each part; scale passes only "
+    "through these"
+)
+"""What photos that nothing joins need."""
 
-    def __init__(self, photos: list[str]):
-        self.photos = photos
+
+class Unjoined(ValueError):
+    """Photos that no common scale joins to the others; `photos` names them, `advice`
+    says what is wrong, or what to measure."""
+
+    def __init__(self, photos: list[str], advice: str = JOINING):
+        self.photos, self.advice = photos, advice
         some = ", ".join(photos[:5]) + (", ..." if len(photos) > 5 else "")
-        super().__init__(
-            f"no scale joins the photos {some} to the others: measure points that lie "
-            "on three photos, two of each part"
-        )
+        super().__init__(f"no scale joins the photos {some} to the others: {advice}")
 
 
 class Oriented(NamedTuple):

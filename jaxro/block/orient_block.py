@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..batches.ragged import Ragged, clean_ragged
+from ..batches.table_noise import estimate
 from ..geometry.pairs import Pair
 from ..orientation.axes import tell_field
 from ..rejection import Recommended, Rejection
@@ -25,6 +26,14 @@ from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, from_pairs
 from .moved_names import NEARLY_ALL, find_moved
 from .place import Placed, TooLittleControl
+
+MOVED = 3.0
+"""Deviations of a point by which a cause moves it at most, if the numbers without the
+cause may be used."""
+
+TOO_SMALL = 3.0
+"""Ratio of the residuals to the given standard deviations from which these are the
+reason why pairs are refused."""
 
 
 class OrientedBlock(NamedTuple):
@@ -76,7 +85,13 @@ def orient_block(
     block = from_pairs(left, right, pairs, points) if more is None else more
     if bars is not None and not np.any(bars.are_in(block)):
         raise NoBar("orient_block: no bar has both of its points in the block")
-    joined = join_pairs(block, left, right, pairs)
+    try:
+        joined = join_pairs(block, left, right, pairs)
+    except Unjoined as error:
+        cause = _of_field(block) or _of_noise(pairs)
+        if cause is None:
+            raise
+        raise Unjoined(error.photos, cause.sentence) from None
     given = Given(joined.block, ground, inner, bars)
     judged = adjust_and_judge(given, joined.chained, level, components, sigma_known)
     cause = joined.cause or judged.cause
@@ -115,7 +130,7 @@ def adjust_and_judge(
         )
         if not (suspicious or of_ground or is_misplaced(given, chained)):
             return Judged(outcome, cause=tell_confusable(given, outcome, level))
-    cause, explained = _of_field(given), None
+    cause, explained = _of_field(given.block), None
     if cause is None:
         found = find_cause(
             given,
@@ -133,15 +148,38 @@ def adjust_and_judge(
     rest = given, outcome.adjusted, outcome.wrong
     against = contradictions(*rest, sigma_known=sigma_known)
     if cause is not None and cause.name in OF_MEASUREMENT and not against:
-        cause = cause._replace(is_hint=True)
+        untrue = explained is not None and _is_moved(outcome, explained)
+        cause = cause._replace(is_hint=not untrue)
     if cause is None and not against:
         cause = tell_confusable(given, outcome, level)
     return Judged(outcome, tuple(against), cause)
 
 
-def _of_field(given: Given) -> Cause | None:
+def _is_moved(outcome: Outcome, explained: Outcome) -> bool:
+    """Whether a point lies elsewhere once the cause is allowed for, farther than its
+    deviations say."""
+    found = outcome.adjusted
+    off = explained.adjusted.coordinates - found.coordinates
+    return bool(np.any(np.abs(off) > MOVED * found.deviations))
+
+
+def _of_noise(pairs: Ragged) -> Cause | None:
+    """Standard deviations that are far smaller than the residuals of the pairs."""
+    try:
+        noise = estimate(pairs)
+    except ValueError:
+        return None
+    if noise.sigma < TOO_SMALL:
+        return None
+    return Cause(
+        "sigma",
+        f"The residuals of the pairs are {noise.sigma:.2g} times the standard deviations "
+        "that are given: are sigma and the focal length in the unit of the coordinates?",
+    )
+
+
+def _of_field(block: MeasuredBlock) -> Cause | None:
     """A focal length in another unit than the places."""
-    block = given.block
     places = np.stack([block.x, block.y], axis=1) / block.focal[block.photo][:, None]
     told = tell_field(places, 1.0)
     if told is None:

@@ -125,8 +125,7 @@ def calculate(task: Task, options: Options) -> Done:
         raise TableError(
             task.title,
             found=f"no scale that joins the photos {some_of(error.photos)} to the others",
-            expected="points on three photos, two of each part: scale passes only "
-            "through these",
+            expected=error.advice,
         ) from None
     except TooLittleControl as error:
         raise TableError(

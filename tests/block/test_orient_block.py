@@ -1,6 +1,7 @@
 """Strips and blocks: a published bundle, a dense adjustment in NumPy, simulation."""
 
 import itertools
+import sys
 
 import numpy as np
 import pytest
@@ -387,3 +388,30 @@ def test_the_sign_of_a_coordinate_on_two_photos_throws_no_block_off():
     block_of = found.adjusted.block
     out = {block_of.points[k] for k in block_of.point[found.wrong.rays]}
     assert names[ray] in out and len(out) <= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda p: p._replace(sigma=p.sigma / 20),
+            "times the standard deviations that are given",
+        ),
+        (
+            lambda p: p._replace(
+                focal_left=p.focal_left / 1e3, focal_right=p.focal_right / 1e3
+            ),
+            "is the focal length in the unit of the coordinates",
+        ),
+    ],
+)
+def test_why_nothing_joins_the_photos_is_told(change, said, monkeypatch):
+    def refuse(measured, *_):
+        raise block.Unjoined([measured.photos[-1]])
+
+    monkeypatch.setattr(sys.modules[orient_block.__module__], "join_pairs", refuse)
+    mock = block.mock_block(4, block.Flight(models=3))
+    left, right, pairs, points = all_pairs(mock.block)
+    with pytest.raises(block.Unjoined, match=said):
+        orient_block(left, right, change(pairs), points, mock.ground)
