@@ -27,16 +27,18 @@ os.environ["XLA_FLAGS"] = " ".join(
 # what several tests, or processes they start, compile is compiled once, and kept for the
 # next run; given a size, JAX locks the folder to write, and gives back what is old
 caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(caches / "jaxro-tests"))
+kept = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(caches / "jaxro-tests")
+os.environ["JAX_COMPILATION_CACHE_DIR"] = kept
 # whole programs, which nobody has to trace again, are kept beside them until a line of
 # the package changes
-os.environ["JAXRO_CACHE"] = os.environ["JAX_COMPILATION_CACHE_DIR"] + "/programs"
+os.environ["JAXRO_CACHE"] = str(Path(kept) / "programs")
 if "PYTEST_XDIST_WORKER" not in os.environ:
     # a run that was killed may have left a program without the time of its use, which
     # JAX never reads again, and warns of
-    for kept in Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).glob("*-cache"):
-        if not kept.with_name(kept.name.removesuffix("cache") + "atime").exists():
-            kept.unlink()
+    for program in Path(kept).glob("*-cache"):
+        used = program.with_name(program.name.removesuffix("cache") + "atime")
+        if not used.exists():
+            program.unlink()
 os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(1 << 32)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 

@@ -85,13 +85,7 @@ def orient_block(
     block = from_pairs(left, right, pairs, points) if more is None else more
     if bars is not None and not np.any(bars.are_in(block)):
         raise NoBar("orient_block: no bar has both of its points in the block")
-    try:
-        joined = join_pairs(block, left, right, pairs)
-    except Unjoined as error:
-        cause = _of_field(block) or _of_noise(pairs)
-        if cause is None:
-            raise
-        raise Unjoined(error.photos, cause.sentence) from None
+    joined = join_pairs(block, left, right, pairs)
     given = Given(joined.block, ground, inner, bars)
     judged = adjust_and_judge(given, joined.chained, level, components, sigma_known)
     cause = joined.cause or judged.cause
@@ -163,8 +157,11 @@ def _is_moved(outcome: Outcome, explained: Outcome) -> bool:
     return bool(np.any(np.abs(off) > MOVED * found.deviations))
 
 
-def _of_noise(pairs: Ragged) -> Cause | None:
-    """Standard deviations that are far smaller than the residuals of the pairs."""
+def _of_noise(pairs: Ragged, oriented: Oriented) -> Cause | None:
+    """Standard deviations that are far smaller than the residuals of the pairs, which
+    are asked for only where points were left out of them."""
+    if np.sum(oriented.kept) > NEARLY_ALL * np.sum(oriented.points):
+        return None
     try:
         noise = estimate(pairs)
     except ValueError:
@@ -201,7 +198,7 @@ def join_pairs(
     block: MeasuredBlock, left: Sequence[str], right: Sequence[str], pairs: Ragged
 ) -> Joined:
     """The photos of a block, chained by their pairs without wrong points. Raises
-    `Unjoined`."""
+    `Unjoined`, with the reason where it is one of the focal length or of sigma."""
     number = {name: k for k, name in enumerate(block.photos)}
     ends = [np.array([number[name] for name in side], int) for side in (left, right)]
     oriented, cause = _orient(pairs), None
@@ -219,7 +216,13 @@ def join_pairs(
     except Unjoined:
         # approximate values need no verdict, and the block is judged as a whole
         more = oriented._replace(usable=_nearly_usable(oriented))
-        chained = chain(block, models_of(*ends, more))
+        try:
+            chained = chain(block, models_of(*ends, more))
+        except Unjoined as error:
+            reason = _of_field(block) or _of_noise(pairs, oriented)
+            if reason is None:
+                raise
+            raise Unjoined(error.photos, reason.sentence) from None
     return Joined(block, chained, np.asarray(oriented.usable), cause)
 
 

@@ -86,11 +86,17 @@ def _complete_plan(at: Coordinates, measured: Sequence[Measured]) -> None:
         length = lengths.get(frozenset((a, b)))
         if length is not None and np.isnan(at[b, 0]):
             at[b, :2] = at[a, :2] + length * np.array([np.cos(t), np.sin(t)])
-    for (a, b, t), (c, d, u) in itertools.combinations(rays, 2):
-        if b == d and a != c and np.isnan(at[b, 0]) and abs(np.sin(u - t)) > FLAT:
-            (x, y), (v, w) = at[c, :2] - at[a, :2], (np.cos(u), np.sin(u))
-            length = (x * w - y * v) / np.sin(u - t)
-            at[b, :2] = at[a, :2] + length * np.array([np.cos(t), np.sin(t)])
+    to_unknown: dict[int, list[tuple[int, float]]] = {}
+    for a, b, t in rays:
+        if np.isnan(at[b, 0]):
+            to_unknown.setdefault(b, []).append((a, t))
+    for b, from_known in to_unknown.items():
+        for (a, t), (c, u) in itertools.combinations(from_known, 2):
+            if a != c and abs(np.sin(u - t)) > FLAT:
+                (x, y), (v, w) = at[c, :2] - at[a, :2], (np.cos(u), np.sin(u))
+                length = (x * w - y * v) / np.sin(u - t)
+                at[b, :2] = at[a, :2] + length * np.array([np.cos(t), np.sin(t)])
+                break
 
 
 def _lengths(measured: Sequence[Measured]) -> dict[frozenset[int], float]:

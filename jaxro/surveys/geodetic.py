@@ -231,8 +231,8 @@ class _Condition(eqx.Module):
         *blocks, (white, values, root, above) = given
         kind = KINDS[self.kind]
         count = len(blocks) - kind.has_set
-        up = jnp.zeros((count, 3)).at[:, 2].set(above)
-        ends = [a + height for a, height in zip(blocks[:count], up, strict=True)]
+        up = jnp.array([0.0, 0.0, 1.0])
+        ends = [a + h * up for a, h in zip(blocks[:count], above, strict=True)]
         found = [
             kind.function(*ends[begin : begin + kind.ends], *blocks[count:])
             for begin in range(0, count, kind.ends)

@@ -29,7 +29,7 @@ MOST = 50_000_000
 """Bytes of a file."""
 
 MOST_TOGETHER = 3000
-"""Measurements with one covariance matrix."""
+"""Numbers with one covariance matrix."""
 
 STATUS = re.compile(r"(xy|XY)?(z|Z)?")
 
@@ -235,12 +235,11 @@ class _Reader:
                 members += [(element, found) for found in one(cluster, element)]
         if len(matrices) > 1:
             raise matrices[1].error("a second <cov-mat>", "one for all")
-        if matrices and len(members) > MOST_TOGETHER:
-            raise matrices[0].error(
-                f"a <cov-mat> of {len(members)} measurements",
-                f"at most {MOST_TOGETHER}",
-            )
         scales = np.array([scale for _, found in members for scale in found.scales])
+        if matrices and len(scales) > MOST_TOGETHER:
+            raise matrices[0].error(
+                f"a <cov-mat> of {len(scales)} numbers", f"at most {MOST_TOGETHER}"
+            )
         matrix = None
         if matrices:
             matrix = covariance_matrix(matrices[0], len(scales)) * np.outer(

@@ -407,10 +407,10 @@ def test_the_sign_of_a_coordinate_on_two_photos_throws_no_block_off():
     ],
 )
 def test_why_nothing_joins_the_photos_is_told(change, said, monkeypatch):
-    def refuse(measured, *_):
+    def refuse(measured, _):
         raise block.Unjoined([measured.photos[-1]])
 
-    monkeypatch.setattr(sys.modules[orient_block.__module__], "join_pairs", refuse)
+    monkeypatch.setattr(sys.modules[orient_block.__module__], "chain", refuse)
     mock = block.mock_block(4, block.Flight(models=3))
     left, right, pairs, points = all_pairs(mock.block)
     with pytest.raises(block.Unjoined, match=said):

@@ -325,10 +325,9 @@ HEADER = "pair,point,x_left,y_left,x_right,y_right\n"
             lambda pairs, ground: (swapped(pairs), ground),
             "for two places of photo '1-2'",
         ),
-        pytest.param(
+        (
             lambda pairs, ground: (divided(pairs), ground),
             "found no scale that joins the photos",
-            marks=pytest.mark.slow,
         ),
     ],
 )

@@ -119,9 +119,8 @@ def compare(
     of_photos = (camera, focal, principal_point, pixel_size, y_down or None)
     if any(value is not None for value in of_photos):
         raise typer.BadParameter("a network has no camera: leave out its options")
-    deviation = None if sigma is None else float(sigma)
     of_network = OfNetwork(
-        file=file, points=points, angles=angles, sigma=deviation, level=false_alarms
+        file=file, points=points, angles=angles, sigma=sigma, level=false_alarms
     )
     end(lambda: run_network(of_network, wanted))
 
