@@ -25,6 +25,10 @@ LEAST = 1e-30
 """What stands for a length of zero where it divides."""
 
 
+HALF = 1e-9
+"""Part of the half of all weight within which it is just half."""
+
+
 class NoBar(ValueError):
     """No bar has both of its points in a block."""
 
@@ -78,12 +82,20 @@ def scale_of(
     given: Bars, block: MeasuredBlock, coordinates: Float[np.ndarray, "point 3"]
 ) -> float:
     """What a network is to be multiplied by to have the lengths of its bars: the median
-    of their ratios; 1 where no bar has both ends."""
+    of their ratios, each with the weight of its precision; 1 where no bar has both
+    ends."""
     one, other = given.numbers_in(block)
     apart = np.linalg.norm(coordinates[one] - coordinates[other], axis=1)
     ratios = given.length / np.maximum(apart, LEAST)
     there = (one >= 0) & (other >= 0) & np.isfinite(ratios)
-    return float(np.median(ratios[there])) if np.any(there) else 1.0
+    if not np.any(there):
+        return 1.0
+    order = np.argsort(ratios[there])
+    below = np.cumsum((apart / given.sigma)[there][order])
+    half = below[-1] / 2
+    # where just half of the weight lies below, the median is between two ratios
+    middle = np.searchsorted(below, [half * (1 - HALF), half * (1 + HALF)])
+    return float(np.mean(ratios[there][order][middle]))
 
 
 def no_bars() -> Bars:

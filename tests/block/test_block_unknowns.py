@@ -7,6 +7,7 @@ import pytest
 from jaxro import block
 from jaxro.block import Flight, Inner, adjust_block
 from jaxro.block.adjust_chained import start_from
+from jaxro.block.bars import scale_of
 from jaxro.block.components import adjust_with_components, components_of
 
 FLIGHT = Flight(strips=3, models=5, relief=200.0)
@@ -210,7 +211,22 @@ def test_bars_give_a_free_network_its_scale():
     assert np.linalg.norm(now[one] - now[other]) == pytest.approx(true, rel=2e-4)
     with pytest.raises(ValueError, match="no bar has both"):
         strange = given._replace(one=("a", "b", "c"))
-        adjust_block(found.block, found.as_start, bars=strange)
+        block.orient_block(left, right, pairs, points, bars=strange)
+
+
+def test_the_scale_of_a_network_is_that_of_its_precise_bars():
+    mock = SMALL
+    names = mock.block.points[:4], mock.block.points[4:8]
+    at = dict(zip(mock.block.points, mock.points, strict=True))
+    apart = zip(*names, strict=True)
+    length = np.array([np.linalg.norm(at[a] - at[b]) for a, b in apart])
+    scale = lambda factors, sigma: scale_of(
+        block.bars(*names, length * factors, sigma), mock.block, mock.points
+    )
+    assert scale([2.0, 2.0, 2.0, 3.0], 0.01) == pytest.approx(2.0)
+    assert scale([2.0, 3.0, 4.0, 5.0], 0.01 * length) == pytest.approx(3.5)
+    imprecise = np.array([0.02, 5000.0, 5000.0, 5000.0])
+    assert scale([2.0, 3.0, 3.0, 3.0], imprecise) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("unknown", [2, 0])
