@@ -160,7 +160,7 @@ def _points_of_other_pose(
     other = narrow(pair, other, WIDE * limit)
     near = points_within(pair, other, limit)
     other, agree = keep_agreeing(pair, other, near, limit, ROUNDS)
-    agree = agree & seen(pair, other, limit)
+    agree = agree & seen(pair, other, limit, agree)
     both = use & agree
     here, there = (sum_of(squares(pair, p), both) for p in (pose, other))
     fits = there <= here * degeneracy.excess(count(both) - 5)

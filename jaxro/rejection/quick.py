@@ -41,7 +41,7 @@ def _all_agree(
 ) -> Bool[Array, ""]:
     linear = linearise(pair, pose)
     small = normalised_residuals(linear, pair.mask) <= limit
-    agree = pair.mask & small & seen(pair, pose, limit)
+    agree = pair.mask & small & seen(pair, pose, limit, pair.mask)
     fits = evidence.fits_well(linear.squares, pair.mask)
     return (count(agree) == count(pair.mask)) & fits
 

@@ -140,5 +140,5 @@ class IsInDoubt(AbstractStep):
         """With the doubtful points."""
         pose, use, _, scale = known.decision
         pair = self.level.judged_by(pair, scale)
-        wrong = pair.mask & ~use & seen(pair, pose, 0.0)
+        wrong = pair.mask & ~use & seen(pair, pose, 0.0, use)
         return known._replace(doubtful=undecided_points(pair, pose, use, wrong))

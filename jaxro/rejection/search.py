@@ -295,8 +295,9 @@ def forward(pose: RelativePose) -> Bool[Array, ""]:
 def cost_of(pair: Pair, pose: RelativePose, limit: ScalarLike) -> Float[Array, ""]:
     """The cost of all points, the most for one that cannot be seen from there; infinite
     where it is no number."""
-    visible = seen(pair, pose, limit)
-    square = jnp.where(visible, squares(pair, pose), limit**2)
+    square = squares(pair, pose)
+    near = pair.mask & (square <= limit**2)
+    square = jnp.where(seen(pair, pose, limit, near), square, limit**2)
     value = sum_of(_point_cost(square, limit), pair.mask)
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
 

@@ -88,7 +88,7 @@ def settle(
     first, other = (jax.tree.map(lambda a, k=k: a[k], judged) for k in range(2))
     better = rest[1] & (costs[1] < costs[0])
     pose, use = choose(better, other, first)
-    return pose, use & seen(pair, pose, limit)
+    return pose, use & seen(pair, pose, limit, use)
 
 
 def believe_if_it_fits(

@@ -109,7 +109,7 @@ def without_unchecked(
         doubted = doubted | (doubtful & some)
         own = pair.with_mask(pair.mask & ~doubted & some)
         pose, use = keep_agreeing(own, pose, use & own.mask, limit, ROUNDS)
-        new = Checked(pose, use & seen(own, pose, limit), doubted)
+        new = Checked(pose, use & seen(own, pose, limit, use), doubted)
         return k + 1, some, choose(some, new, before)
 
     start = jnp.zeros((), int), most >= 1, Checked(pose, use, use & False)

@@ -56,7 +56,8 @@ def verdict_on(
     as |w| says; it is infinite for a point that was rejected as it cannot be seen."""
     enough = count(pair.mask) > 5
     limit = jnp.asarray(limit, w.dtype)
-    unseen = ~use & (w <= limit) & ~seen(pair, solved.pose, limit)
+    visible = seen(pair, solved.pose, limit, use)
+    unseen = ~use & (w <= limit) & ~visible
     w = jnp.where(unseen, jnp.inf, w)
     only = Round(
         statistic=jnp.where(pair.mask & enough, w, 0.0),

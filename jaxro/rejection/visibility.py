@@ -14,23 +14,26 @@ from .masked import Use
 
 
 class Visibility(NamedTuple):
-    """The points in front of both photos, with the sign of the base that puts most
-    points there; and those whose rays are parallel within a limit."""
+    """The points in front of both photos, with the sign of the base that puts most of
+    those that agree there; and those whose rays are parallel within a limit."""
 
     in_front: Use
     parallel: Use
 
 
-def seen(pair: Pair, pose: RelativePose, limit: ArrayLike) -> Use:
+def seen(pair: Pair, pose: RelativePose, limit: ArrayLike, use: Use) -> Use:
     """The points in front of both photos, and those whose rays are so nearly parallel
-    that the sign of their depth says nothing."""
-    visible = look(pair, pose, limit)
+    that the sign of their depth says nothing. The points in `use` tell on which side of
+    the left photo the right one is: of many wrong ones most may lie behind."""
+    visible = look(pair, pose, limit, use)
     return visible.in_front | visible.parallel
 
 
-def look(pair: Pair, pose: RelativePose, limit: ArrayLike = 0.0) -> Visibility:
+def look(
+    pair: Pair, pose: RelativePose, limit: ArrayLike = 0.0, use: Use | bool = True
+) -> Visibility:
     """`Visibility` of the points; `limit`: in standard deviations of the angle between
-    the rays."""
+    the rays; `use`: the points that agree with the pose."""
     rotation, base = pose.relative()
     focals = pair.focal_left, pair.focal_right
 
@@ -49,6 +52,6 @@ def look(pair: Pair, pose: RelativePose, limit: ArrayLike = 0.0) -> Visibility:
     front = pair.mask & (left > 0) & (right > 0)
     behind = pair.mask & (left < 0) & (right < 0)
     return Visibility(
-        in_front=jnp.where(count(front) >= count(behind), front, behind),
+        in_front=jnp.where(count(front & use) >= count(behind & use), front, behind),
         parallel=pair.mask & parallel,
     )
