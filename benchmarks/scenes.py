@@ -853,3 +853,49 @@ def _piece(rng: np.random.Generator, photo: Photo, count: int) -> tuple[Array, A
         right, front = project(space, rotation, base, photo.focal)
         if np.all(front & photo.holds(right) & photo.holds(left) & (depth > 0.2)):
             return left, right
+
+
+# ------------------------------------------------------------------------------------
+# two scenes in one photo
+
+
+def two_scenes(
+    pairs: int, first: int, second: int, points: int, *, seed: int = 0
+) -> Scenes:
+    """Pairs of photographs of which so many matches belong to one scene and to another,
+    which has moved between the photos; of the `points` matches all others are wrong.
+    `good` and the pose are those of the first scene, `undecidable` matches those of the
+    second."""
+    parts = []
+    for number in range(pairs):
+        rng = np.random.default_rng([seed, number, first, second, points])
+        parts.append(_two_scenes(rng, first, second, points, number))
+    fields = zip(*parts, strict=True)
+    return Scenes(*(np.stack([np.asarray(v) for v in field]) for field in fields))
+
+
+def _two_scenes(
+    rng: np.random.Generator, first: int, second: int, points: int, number: int
+) -> tuple:
+    """The fields of one pair."""
+    kind, seed = BASES[number % len(BASES)], int(rng.integers(1 << 30))
+    pair = photographs(1, points, 1 - first / points, kind, seed=seed)
+    coordinates = np.stack(pair.coordinates)[:, 0]
+    photo = _photo_of(coordinates, float(pair.focal[0]))
+    while True:
+        rotation, base, distance = placed(rng, str(rng.choice(BASES)))
+        left = photo.uniform(rng, 6 * second + 200)
+        depth = depths(rng, left, photo.focal, distance)
+        space = rays(left, photo.focal) / photo.focal * depth[:, None]
+        right, front = project(space, rotation, base, photo.focal)
+        seen = front & photo.holds(right) & (depth > 0.2)
+        if np.sum(seen) >= second:
+            break
+    sides = noise(rng, left[seen][:second], right[seen][:second], photo, pair.sigma[0])
+    places = rng.permutation(np.flatnonzero(~pair.good[0]))[:second]
+    coordinates[:, places] = np.concatenate(sides, axis=1).T
+    of_second = np.isin(np.arange(points), places)
+    before, after = (
+        [field[0] for field in tuple(pair)[k]] for k in (slice(4, 6), slice(7, None))
+    )
+    return (*coordinates, *before, of_second, *after)

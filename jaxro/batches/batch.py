@@ -286,7 +286,9 @@ def judge_slabs(
     split, chunk = _split_of(step, pairs, split)
     program = _judge_slab.using(settings or _settings(pairs))
     program = program.bind(step=step, chunk=chunk)
-    return spread((pairs, known), program, split, chunk, report)
+    read = [getattr(known, name) for name in step.reads]
+    new = spread((pairs, read), program, split, chunk, report)
+    return known._replace(**dict(zip(step.changes, new, strict=True)))
 
 
 def conclude_slabs(
@@ -423,9 +425,16 @@ def _clean_slab(
 
 @compiled(unit="points")
 def _judge_slab(
-    data: tuple[Pair, Judgement], *, step: AbstractStep, chunk: int
-) -> Judgement:
-    return map_chunks(lambda one: step.judge(*one), data, chunk)
+    data: tuple[Pair, list[PyTree]], *, step: AbstractStep, chunk: int
+) -> list[PyTree]:
+    def one(data: tuple[Pair, list[PyTree]]) -> list[PyTree]:
+        pair, read = data
+        fields: dict[str, Any] = dict.fromkeys(Judgement._fields)
+        fields |= zip(step.reads, read, strict=True)
+        new = step.judge(pair, Judgement(**fields))
+        return [getattr(new, name) for name in step.changes]
+
+    return map_chunks(one, data, chunk)
 
 
 @compiled(unit="points")

@@ -29,6 +29,7 @@ from .batch import (
     orient_slabs_near,
     problem_of_all,
 )
+from .decisions import Decisions as Decisions, decisions
 from .padding import Plan, plan_for
 
 LONG = 64
@@ -259,28 +260,6 @@ def orient_ragged(
     return eqx.combine(*out.tree) if read is split else out.tree
 
 
-class Decisions(NamedTuple):
-    """What a procedure decided: of every row whether it is kept, in which round it
-    went, and its statistic then; of every pair the outcome, a number of
-    `rejection.OUTCOMES`; of every row whether it is `undecided`."""
-
-    kept: Bool[np.ndarray, " row"]
-    order: Int[np.ndarray, " row"]
-    statistic: Flat
-    outcome: Int[np.ndarray, " pair"]
-    undecided: Bool[np.ndarray, " row"]
-
-
-def decisions(_: Pair, rejection: Rejection) -> tuple[PyTree, PyTree]:
-    """The outcome of a pair; of every point (kept, order, statistic, undecided)."""
-    return rejection.outcome._value, (
-        rejection.mask,
-        rejection.order,
-        rejection.statistic,
-        rejection.undecided,
-    )
-
-
 def clean_ragged(
     pairs: Ragged,
     procedure: AbstractProcedure,
@@ -313,13 +292,18 @@ def clean_ragged(
             out.store(members, size, found)
     if read is not decisions:
         return out.tree
-    outcome, (kept, order, statistic, undecided) = out.tree
+    (outcome, probability, own, pose), of_points = out.tree
+    kept, order, statistic, undecided, rival = of_points
     return Decisions(
         kept=kept,
         order=order,
         statistic=statistic,
         outcome=outcome,
         undecided=undecided,
+        rival=rival,
+        probability=probability,
+        own=own,
+        pose=pose,
     )
 
 

@@ -26,8 +26,9 @@ CONFIG = {
     Kind.weak: 2,
     Kind.no_consensus: 1,
     Kind.too_few: 1,
+    Kind.several: 8,
 }
-"""COLMAP's number: CALIBRATED 2, PLANAR 4, PANORAMIC 5, DEGENERATE 1."""
+"""COLMAP's number: CALIBRATED 2, PLANAR 4, PANORAMIC 5, DEGENERATE 1, MULTIPLE 8."""
 
 CONTENT = {
     Kind.oriented: ("F", "E", "qvec", "tvec"),
@@ -37,9 +38,10 @@ CONTENT = {
     Kind.weak: ("F", "E"),
     Kind.no_consensus: (),
     Kind.too_few: (),
+    Kind.several: (),
 }
-"""What is written of a pair besides its matches: no pose where the matches have two, nor
-where the base is too short for its errors."""
+"""What is written of a pair besides its matches: no pose where the matches have two or
+more, nor where the base is too short for its errors."""
 
 Matrices = Float[np.ndarray, "pair 3 3"]
 

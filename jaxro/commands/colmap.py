@@ -30,6 +30,10 @@ MEANING = {
         "DEGENERATE, no matches: agreement could be an accident",
     ),
     Kind.too_few: ("too few", "DEGENERATE, no matches: fewer than six"),
+    Kind.several: (
+        "several poses",
+        "MULTIPLE, without pose: some matches each, none by accident",
+    ),
 }
 GOOD = (Kind.oriented, Kind.plane, Kind.two_poses, Kind.rotation)
 

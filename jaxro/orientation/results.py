@@ -65,6 +65,13 @@ class RESULTS(results.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "rejected may agree with it by chance. Measure these points again, or more "
         "points at other depths."
     )
+    several_solutions = (
+        "Other points, far apart from each other, agree with another orientation, and "
+        "neither can be an accident: something moved, looks alike at two places, or "
+        "two scenes are in view. Nothing in the measurements says which orientation is "
+        "that of the photos. Those that were found are listed with their points: leave "
+        "out the points of the others, or measure more."
+    )
     mirrored = (
         "All points fit, but lie behind the right photo: y of one photo counts the "
         "other way (downwards), or its x and y are exchanged. With one photo mirrored "

@@ -11,6 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from ..geometry.elements import RelativePose, vertical
 from ..geometry.pairs import Pair, double, first_points, pad, quickly, room_for
 from ..orientation.orient import Orientation
 from ..xla.passes import count
@@ -77,6 +78,34 @@ class Log(eqx.Module):
     elements: Float[Array, "*pairs round 5"]
 
 
+class Rivals(eqx.Module):
+    """Other consensuses, of points that were rejected: several poses explain some of the
+    points each, and none of them by accident.
+
+    `mask`: the points of each; no point is true where there is no such consensus.
+    `pose`: of each, by least squares. `probability`: that so many points agree with it by
+    accident, as it is judged by (1 where there is none), and `own`, the same of the
+    points that were kept, 1 where nobody asked. The last axis is that of the points or
+    that of the consensuses.
+    """
+
+    mask: Bool[Array, "*pairs rival point"]
+    pose: RelativePose
+    probability: Float[Array, "*pairs rival"]
+    own: Float[Array, "*pairs"]
+
+
+def no_rivals(points: int) -> Rivals:
+    """Those of a procedure that looks for none, of a pair of so many points."""
+    none = jnp.zeros(0)
+    return Rivals(
+        mask=jnp.zeros((0, points), bool),
+        pose=vertical(none),
+        probability=none,
+        own=jnp.ones(()),
+    )
+
+
 class Rejection(eqx.Module):
     """The result of a procedure; for a batch every field has leading axes.
 
@@ -86,6 +115,8 @@ class Rejection(eqx.Module):
     wrong, but the measurements do not tell which; they are kept. `orientation`: from
     the points `in_use`, those kept but for the undecided one that is most likely wrong.
     `unchecked`: points rejected though they fit, as no other point checks them.
+    `rivals`: other consensuses; of procedures that look for none there is no place for
+    them.
     """
 
     mask: Bool[Array, "*pairs point"]
@@ -97,6 +128,7 @@ class Rejection(eqx.Module):
     undecided: Bool[Array, "*pairs point"]
     in_use: Bool[Array, "*pairs point"]
     unchecked: Bool[Array, "*pairs point"]
+    rivals: Rivals
 
     def first(self, points: int) -> "Rejection":
         """The same without the places behind so many points."""
@@ -104,7 +136,7 @@ class Rejection(eqx.Module):
             return self
         of_points = lambda r: [
             *(r.mask, r.order, r.statistic, r.undecided, r.in_use, r.unchecked),
-            *(r.log.statistic, r.log.rejected, r.log.parallax),
+            *(r.rivals.mask, r.log.statistic, r.log.rejected, r.log.parallax),
         ]
         short = eqx.tree_at(of_points, self, first_points(of_points(self), points))
         return dataclasses.replace(short, orientation=self.orientation.first(points))

@@ -18,7 +18,7 @@ where d of the points choose the base freely (compare `evidence.log_accidents`).
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,7 @@ from ..xla.kernels import while_loop
 from ..xla.passes import count
 from .agreement import keep_agreeing, points_within, squares
 from .evidence import chance_of_agreement
-from .judgement import AbstractStep, Judgement, Witnesses
+from .judgement import OF_DECISION, AbstractStep, Judgement, Witnesses
 from .level import Level
 from .masked import Use, choose, sum_of
 from .stages import FLAT, ROUNDS
@@ -81,6 +81,8 @@ class IsCarried(AbstractStep):
     points that it explains; or else whether few points carry the base."""
 
     level: Level
+    reads: ClassVar[tuple[str, ...]] = ("decision",)
+    changes: ClassVar[tuple[str, ...]] = (*OF_DECISION, "base")
 
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
         return known.decision.believed
@@ -124,6 +126,8 @@ class HasSecond(AbstractStep):
     """Whether the other pose of the plane of the points explains all but few."""
 
     level: Level
+    reads: ClassVar[tuple[str, ...]] = ("decision", "base")
+    changes: ClassVar[tuple[str, ...]] = ("base",)
 
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
         return known.decision.believed & known.base.flat

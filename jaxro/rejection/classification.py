@@ -38,7 +38,7 @@ that of a plane scene."""
 
 class Kind(enum.IntEnum):
     """How the orientation of a pair from its matches ended; `two_poses`: of a plane, both
-    of which explain the matches."""
+    of which explain the matches; `several`: other matches agree with another pose."""
 
     oriented = 0
     plane = 1
@@ -47,12 +47,14 @@ class Kind(enum.IntEnum):
     weak = 4
     no_consensus = 5
     too_few = 6
+    several = 7
 
 
 class Found(eqx.Module):
     """Matches kept, the pose by them (quaternion w, x, y, z; R; unit base), the normal n
     of the plane n · λ p1 / f1 = 1 nearest to them, sigma0, and the number of a
-    `Kind`."""
+    `Kind`. Of `several` poses the matches of all are kept, and the pose is that of the
+    first."""
 
     kept: Bool[Array, "*pairs match"]
     quaternion: Float[Array, "*pairs 4"]
@@ -64,10 +66,11 @@ class Found(eqx.Module):
 
 
 class Verdict(NamedTuple):
-    """What the engine says of a pair: matches kept, the pose by them and how that
-    ended, and the outcome."""
+    """What the engine says of a pair: matches kept, those of other consensuses, the pose
+    by those kept and how that ended, and the outcome."""
 
     mask: Bool[Array, "*pairs match"]
+    others: Bool[Array, "*pairs match"]
     pose: RelativePose
     result: RESULTS
     outcome: OUTCOMES
@@ -76,7 +79,13 @@ class Verdict(NamedTuple):
 def verdict(_: Pair, rejection: Rejection) -> Verdict:
     """The part of a rejection that is needed here."""
     solved = rejection.orientation
-    return Verdict(rejection.mask, solved.pose, solved.result, rejection.outcome)
+    return Verdict(
+        mask=rejection.mask,
+        others=jnp.any(rejection.rivals.mask, axis=0),
+        pose=solved.pose,
+        result=solved.result,
+        outcome=rejection.outcome,
+    )
 
 
 def classify(pair: Pair, verdict: Verdict) -> Found:
@@ -91,6 +100,7 @@ def classify(pair: Pair, verdict: Verdict) -> Found:
     plane = _plane(pair, verdict.pose, use)
     turned = result == RESULTS.zero_base
     weak = (result == RESULTS.weakly_determined) | (result == RESULTS.carried_by_few)
+    several = result == RESULTS.several_solutions
     usable = is_usable(result)
     kind = jnp.where(usable, int(Kind.oriented), int(Kind.no_consensus))
     for holds, other in (
@@ -98,14 +108,16 @@ def classify(pair: Pair, verdict: Verdict) -> Found:
         (result == RESULTS.two_solutions, Kind.two_poses),
         (weak, Kind.weak),
         (turned, Kind.rotation),
+        (several, Kind.several),
         (~believed, Kind.no_consensus),
         (count(pair.mask) < 6, Kind.too_few),
     ):
         kind = jnp.where(holds, int(other), kind)
     rotation, _ = rotation_only(*vectors(pair), use)
     pose = choose(turned, rotation, verdict.pose)
+    kept = use & (kind < int(Kind.no_consensus))
     return Found(
-        kept=use & (kind < int(Kind.no_consensus)),
+        kept=jnp.where(kind == int(Kind.several), use | verdict.others, kept),
         quaternion=pose.quaternion,
         rotation=rot.as_array(pose.relative()[0]),
         base=pose.base,

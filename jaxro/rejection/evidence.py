@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import gammaln
-from jaxtyping import Array, ArrayLike, Bool, Float, ScalarLike
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, ScalarLike
 
 from ..geometry.elements import RelativePose
 from ..geometry.pairs import Pair
@@ -34,6 +34,9 @@ PARTS = [2 ** (-k / 4) for k in range(14)]
 """Parts of the limit within which points are counted, down to a tenth: below it points
 are no nearer than by accident."""
 
+
+Cells = Int[Array, "point"]
+"""Of each point the number of its cell."""
 
 CELLS = 10
 """Cells along the longer side of what the points cover of a photo."""
@@ -207,6 +210,12 @@ def apart(pair: Pair) -> Use:
     at few places, which agree with each other whatever they are: all of a cell are one
     witness.
     """
+    return one_of_each(cells(pair), pair.mask)
+
+
+def cells(pair: Pair) -> Cells:
+    """In which cell of both photos each point lies, by numbers less than that of the
+    points."""
     key = jnp.zeros_like(pair.sigma)
     x_left, y_left, x_right, y_right = pair.coordinates
     for x, y in ((x_left, y_left), (x_right, y_right)):
@@ -218,9 +227,21 @@ def apart(pair: Pair) -> Use:
     key = jnp.where(pair.mask, key, jnp.inf)
     order = jnp.argsort(key, stable=True)
     in_order = key[order]
-    new = jnp.concatenate([jnp.ones(1, bool), in_order[1:] != in_order[:-1]])
-    none = jnp.zeros_like(pair.mask)
-    return pair.mask & none.at[order].set(new)
+    new = jnp.concatenate([jnp.zeros(1, bool), in_order[1:] != in_order[:-1]])
+    return jnp.zeros_like(order).at[order].set(jnp.cumsum(new.astype(order.dtype)))
+
+
+def one_of_each(cell: Cells, use: Use) -> Use:
+    """The first of these points in each cell."""
+    place = jnp.arange(cell.size)
+    nobody = jnp.full_like(place, cell.size)
+    first = nobody.at[cell].min(jnp.where(use, place, cell.size))
+    return use & (place == first[cell])
+
+
+def held_by(cell: Cells, use: Use) -> Bool[Array, "cell"]:
+    """The cells that one of these points is in."""
+    return jnp.zeros_like(use).at[cell].max(use)
 
 
 def _from_first(pair: Pair, values: Values) -> Values:

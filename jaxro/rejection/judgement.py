@@ -15,7 +15,11 @@ from ..geometry.pairs import Pair
 from ..xla.kernels import if_needed
 from ..xla.passes import count
 from .fading import is_heavy
-from .search import Found
+from .search import ALL_BLOCKS, Found
+
+RIVALS = 2
+"""Consensuses beside the one that is believed of which is told, at most: so many make it
+plain that the photos do not say it themselves."""
 
 
 class Decision(NamedTuple):
@@ -31,13 +35,22 @@ class Decision(NamedTuple):
 class Sought(NamedTuple):
     """What is known between the parts of a search: how many times it has begun, whether
     it is to begin `again`, the points that it is to search among, what it has found,
-    and the factor of the standard deviations that this shows."""
+    and the factor of the standard deviations that this shows; the fewest points that
+    are worth a look, which is zero but for a search for rivals of what is believed,
+    and the most blocks of subsets that it may take."""
 
     number: Int[Any, "*pairs"]
     again: Bool[Any, "*pairs"]
     among: Bool[Any, "*pairs point"]
     found: Found
     scale: Float[Any, "*pairs"]
+    fewest: Float[Any, "*pairs"]
+    blocks: Int[Any, "*pairs"]
+
+    @property
+    def for_rival(self) -> Bool[Any, "*pairs"]:
+        """Whether what is sought is a rival of what is believed."""
+        return self.fewest > 0
 
 
 class Witnesses(NamedTuple):
@@ -53,6 +66,19 @@ class Witnesses(NamedTuple):
     chance: Float[Any, "*pairs"]
 
 
+class Contest(NamedTuple):
+    """The consensuses of a pair (`rivals`). Of the one that is believed: the logarithm of
+    the expected number of accidents as good, zero where that was not asked, and whether
+    it does not stand out. Of each rival the same number, zero where there is none, its
+    pose (qw, qx, qy, qz, bx, by, bz), and its points."""
+
+    own: Float[Any, "*pairs"]
+    contested: Bool[Any, "*pairs"]
+    accidents: Float[Any, "*pairs rival"]
+    pose: Float[Any, "*pairs rival 7"]
+    use: tuple[Bool[Any, "*pairs point"], ...]
+
+
 class OfPoints(NamedTuple):
     """What a judgement holds of every point."""
 
@@ -60,14 +86,15 @@ class OfPoints(NamedTuple):
     among: Any
     unchecked: Any
     doubtful: Any
+    rivals: Any
 
 
 class Judgement(NamedTuple):
     """What is known of a pair after some steps of a procedure: the decision, how many
     points are `kept` and how many are `out` by it, whether their noise is `heavy`
     (`fading`), what was `sought`, the witnesses of the base, the points that are out as
-    they are `unchecked`, and the `doubtful` points, of which some are wrong, though
-    nothing tells which."""
+    they are `unchecked`, the `doubtful` points, of which some are wrong, though
+    nothing tells which, and the consensuses in contest."""
 
     decision: Decision
     kept: Float[Any, "*pairs"]
@@ -77,6 +104,7 @@ class Judgement(NamedTuple):
     base: Witnesses
     unchecked: Bool[Any, "*pairs point"]
     doubtful: Bool[Any, "*pairs point"]
+    contest: Contest
 
     def decided(self, pair: Pair, decision: Decision) -> "Judgement":
         """The same with another decision about the pair, which has no unusable points
@@ -92,7 +120,8 @@ class Judgement(NamedTuple):
     def split(self) -> tuple["Judgement", OfPoints]:
         """What is of the pair, and what is of its points."""
         own = self.decision.use, self.sought.among, self.unchecked, self.doubtful
-        return self.join(OfPoints(None, None, None, None)), OfPoints(*own)
+        of_points = OfPoints(*own, self.contest.use)
+        return self.join(OfPoints(*[None] * len(of_points))), of_points
 
     def join(self, of_points: OfPoints) -> "Judgement":
         """What `split` has taken apart."""
@@ -101,6 +130,7 @@ class Judgement(NamedTuple):
             sought=self.sought._replace(among=of_points.among),
             unchecked=of_points.unchecked,
             doubtful=of_points.doubtful,
+            contest=self.contest._replace(use=of_points.rivals),
         )
 
 
@@ -123,15 +153,31 @@ def nothing_known(focal: Float[Any, "*pairs"], mask: Bool[Any, "..."]) -> Judgem
         agreed=zero(),
         asked=zero(),
     )
+    contest = Contest(
+        own=zero(),
+        contested=no(),
+        accidents=zero()[..., None].repeat(RIVALS, -1),
+        pose=zero()[..., None, None].repeat(RIVALS, -2).repeat(7, -1),
+        use=tuple(none() for _ in range(RIVALS)),
+    )
     return Judgement(
         decision=Decision(pose=pose(), use=none(), believed=no(), scale=one()),
         kept=zero(),
         out=zero(),
         heavy=no(),
-        sought=Sought(number(), ~no(), ~none() & mask, found, one()),
+        sought=Sought(
+            number=number(),
+            again=~no(),
+            among=~none() & mask,
+            found=found,
+            scale=one(),
+            fewest=zero(),
+            blocks=number() + ALL_BLOCKS,
+        ),
         base=Witnesses(turned=no(), few=no(), flat=no(), second=no(), chance=one()),
         unchecked=none(),
         doubtful=none(),
+        contest=contest,
     )
 
 
@@ -142,9 +188,17 @@ def _structure() -> Any:
     return jax.tree.structure(jax.eval_shape(vertical, number))
 
 
+OF_DECISION = ("decision", "kept", "out", "heavy")
+"""The fields of a judgement that another decision changes."""
+
+
 class AbstractStep(eqx.Module):
     """A step of a procedure, a program of its own: it judges the pairs that are open to
-    it. Most pairs are open to few steps."""
+    it. Most pairs are open to few steps. `reads` and `changes`: the
+    fields of a judgement that it looks at, and that it tells anew."""
+
+    reads: eqx.AbstractClassVar[tuple[str, ...]]
+    changes: eqx.AbstractClassVar[tuple[str, ...]]
 
     @abc.abstractmethod
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:

@@ -16,7 +16,7 @@ points, which finds few and small errors best.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 from jaxtyping import Array, Bool, ScalarLike
 
@@ -32,6 +32,7 @@ from .fading import fade
 from .judgement import AbstractStep, Judgement, if_open, nothing_known
 from .level import Level
 from .quick import Plain, Quick
+from .rivals import LooksForRivals, judge_contest, steps_of, tell_rivals
 from .stages import FEW, AbstractStage, Decides
 from .thorough import Thorough
 from .unchecked import IsChecked
@@ -63,15 +64,18 @@ class Recommended(AbstractProcedure):
     def clean(self, pair: Pair) -> Rejection:
         known = nothing_known(pair.focal_left, pair.mask)
         decide = [Decides(stage, self._level) for stage in self._deciding]
-        for step in (*decide, *self._checks):
+        look = [LooksForRivals(search, self._level) for search in self._rivals]
+        for step in (*decide, *self._checks, *look):
             known = if_open(step, pair, known)
         return self.conclude(pair, known)
 
     def steps(self) -> list[AbstractStep]:
-        """Those of every stage, then what is asked of what they found."""
+        """Those of every stage, then what is asked of what they found, then the search
+        for rivals."""
         level = self._level
         decide = [step for stage in self._deciding for step in stage.as_steps(level)]
-        return [*decide, *self._checks]
+        look = [step for search in self._rivals for step in steps_of(search, level)]
+        return [*decide, *self._checks, *look]
 
     def is_usual(self, known: Judgement) -> Bool[Any, "*pairs"]:
         return ~(known.heavy & known.decision.believed)
@@ -99,12 +103,13 @@ class Recommended(AbstractProcedure):
         pose, use, believed, scale = known.decision
         judged_by = self._level.judged_by(pair, scale)
         w = normalised_residuals(linearise(judged_by, pose), use)
-        solved = judge_base(known.base, solved)
+        solved = judge_contest(known.contest, judge_base(known.base, solved))
         limit = self._level.limit(pair)
         result = verdict_on(pair, solved, testable(pair, use), limit, w)
         result = result.only_if(believed, OUTCOMES.no_consensus)
         fit = known.unchecked & (result.statistic <= limit)
-        result = dataclasses.replace(result, unchecked=fit)
+        rivals = tell_rivals(known.contest)
+        result = dataclasses.replace(result, unchecked=fit, rivals=rivals)
         return result.take_back(known.doubtful)
 
     @property
@@ -125,12 +130,20 @@ class Recommended(AbstractProcedure):
         searches = (stage for stage in self.stages if isinstance(stage, Thorough))
         return tuple(dataclasses.replace(stage, known=False) for stage in searches)
 
+    @property
+    def _rivals(self) -> tuple[Thorough, ...]:
+        """The last stage that searches in any position, which looks for rivals."""
+        stages = self._deciding
+        return tuple(stage for stage in stages if isinstance(stage, Thorough))[-1:]
+
 
 class IsInDoubt(AbstractStep):
     """The points of which some are wrong, though nothing tells which; only of pairs with
     few points out."""
 
     level: Level
+    reads: ClassVar[tuple[str, ...]] = ("decision",)
+    changes: ClassVar[tuple[str, ...]] = ("doubtful",)
 
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
         some = (known.out > 0) & (known.out <= FEW)

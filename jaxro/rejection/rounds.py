@@ -21,7 +21,7 @@ from ..orientation.orient import Orientation
 from ..orientation.results import is_usable
 from ..xla.kernels import while_loop
 from ..xla.passes import count
-from .base import OUTCOMES, Log, PointValues, Rejection
+from .base import OUTCOMES, Log, PointValues, Rejection, no_rivals
 
 
 class Round(NamedTuple):
@@ -162,6 +162,7 @@ def conclude(
         undecided=doubtful,
         in_use=history.mask,
         unchecked=history.mask & False,
+        rivals=no_rivals(history.mask.shape[0]),
     )
 
 

@@ -61,6 +61,9 @@ FIRST_GUIDED, GUIDED = 2, 24
 """The first block that is drawn from the points whose neighbours agree, and the number
 of blocks of which every second one then is."""
 
+ALL_BLOCKS = 1 << 30
+"""More blocks of subsets than any search solves."""
+
 FINE = 0.25
 """Multiple of sigma within which points are about equally near."""
 
@@ -170,13 +173,18 @@ class Search(eqx.Module):
         return nothing_found(pose)._replace(cost=cost, enough=enough)
 
     def run(
-        self, pair: Pair, found: Found, worth: Float[Array, ""] | float = math.inf
+        self,
+        pair: Pair,
+        found: Found,
+        worth: Float[Array, ""] | float = math.inf,
+        blocks: Int[Array, ""] | int = ALL_BLOCKS,
     ) -> Found:
         """The search, continued until it is enough, or until as many subsets as it is
-        `worth` have been solved."""
+        `worth`, or so many `blocks`, have been solved."""
         most = -(-self.count // self.block)
         sample = _sample(pair)
         guided = sample.has_order and most > FIRST_GUIDED
+        most = jnp.minimum(most, blocks)
 
         def more(state: tuple[Found, Order]) -> Bool[Array, ""]:
             found, _ = state

@@ -2,7 +2,7 @@
 one. Another stage is another `AbstractStage`; here stands what stages share."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from ..orientation import planes
 from ..xla.passes import count
 from . import evidence
 from .agreement import keep_agreeing, one_by_one, points_within, squares
-from .judgement import AbstractStep, Decision, Judgement
+from .judgement import OF_DECISION, AbstractStep, Decision, Judgement
 from .level import Level
 from .masked import Use, choose
 from .visibility import seen
@@ -56,6 +56,8 @@ class Decides(AbstractStep):
 
     stage: AbstractStage
     level: Level
+    reads: ClassVar[tuple[str, ...]] = ()
+    changes: ClassVar[tuple[str, ...]] = OF_DECISION
 
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
         return ~known.decision.believed

@@ -2,7 +2,7 @@
 it finds."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,14 @@ from . import evidence
 from .agreement import points_within, scale_sigma, squares
 from .graduated_non_convexity import GraduatedNonConvexity
 from .hypotheses import Newton, best
-from .judgement import AbstractStep, Decision, Judgement, Sought, nothing_known
+from .judgement import (
+    OF_DECISION,
+    AbstractStep,
+    Decision,
+    Judgement,
+    Sought,
+    nothing_known,
+)
 from .level import Level
 from .masked import Use, choose, sum_of
 from .noise import noise_of
@@ -134,8 +141,13 @@ class Thorough(AbstractStage):
     def seek(self, pair: Pair, sought: Sought, limit: Float[Array, ""]) -> Sought:
         """What is found among the points that are left to search."""
         own = mask_unusable(pair.with_mask(pair.mask & sought.among))[0]
-        found, scale = self._search(own, self._near_vertical(own), limit)
-        return sought._replace(found=found, scale=scale)
+
+        near = lambda needed: self._near_vertical(_if(needed, own))
+        first = if_needed(~sought.for_rival, near, sought.found.pose)
+        found, scale = self._search(own, first, sought, limit)
+        agree = count(points_within(scale_sigma(own, scale), found.pose, limit))
+        again = sought.again & (agree >= sought.fewest)
+        return sought._replace(found=found, scale=scale, again=again)
 
     def settle(
         self, pair: Pair, before: Decision, sought: Sought, limit: Float[Array, ""]
@@ -192,19 +204,32 @@ class Thorough(AbstractStage):
         return (accidents <= self._most_accidents(of)) & thorough
 
     def _search(
-        self, pair: Pair, first: RelativePose, limit: Float[Array, ""]
+        self,
+        pair: Pair,
+        first: RelativePose,
+        sought: Sought,
+        limit: Float[Array, ""],
     ) -> tuple[Found, Float[Array, ""]]:
         """The search from a first pose, and the noise to judge by, as a multiple of the
-        stated one."""
+        stated one: for a rival that of what is believed."""
+        first_one = ~sought.for_rival
 
         def turn(state: Turn) -> Turn:
             scale = state.scale
             own = scale_sigma(pair, scale)
             begin = self.search.begin(own, state.found.pose)
-            worth = self._worth(own, state.found.pose, limit)
-            found = self.search.run(own, begin, worth)
-            narrowed = narrow(own, found.pose, self.search.limit)
-            new = self._new_scale(pair, own, scale, found.pose, narrowed)
+
+            def worth(needed: Bool[Array, ""]) -> Float[Array, ""]:
+                return self._worth(_if(needed, own), state.found.pose, limit)
+
+            def noise(needed: Bool[Array, ""]) -> tuple[RelativePose, Array]:
+                narrowed = narrow(_if(needed, own), found.pose, self.search.limit)
+                every = _if(needed, pair), _if(needed, own)
+                return narrowed, self._new_scale(*every, scale, found.pose, narrowed)
+
+            most = if_needed(first_one, worth, jnp.full_like(scale, jnp.inf))
+            found = self.search.run(own, begin, most, sought.blocks)
+            narrowed, new = if_needed(first_one, noise, (found.pose, scale))
             again = (new < APART * scale) | (scale < APART * new)
             pose = choose(again, narrowed, found.pose)
             return Turn(
@@ -217,7 +242,7 @@ class Thorough(AbstractStage):
         start = Turn(
             number=jnp.zeros((), int),
             again=count(pair.mask) > 0,
-            scale=jnp.ones_like(limit),
+            scale=jnp.where(first_one, 1.0, sought.scale),
             found=nothing_found(first),
         )
         more = lambda state: state.again & (state.number < TURNS)
@@ -273,6 +298,11 @@ class Thorough(AbstractStage):
         return best(poses, costs)
 
 
+def _if(needed: Bool[Array, ""], pair: Pair) -> Pair:
+    """The pair, without points where it is not needed."""
+    return mask_unusable(pair.with_mask(pair.mask & needed))[0]
+
+
 class AbstractSearching(AbstractStep):
     """A part of `Thorough`, which goes on until it is not to begin again."""
 
@@ -284,7 +314,14 @@ class AbstractSearching(AbstractStep):
 
 
 class Seeks(AbstractSearching):
-    """The search of `Thorough`."""
+    """The search of `Thorough`, for a rival of what is believed as well."""
+
+    reads: ClassVar[tuple[str, ...]] = ("sought",)
+    changes: ClassVar[tuple[str, ...]] = ("sought",)
+
+    def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
+        wanted = ~known.decision.believed | known.sought.for_rival
+        return wanted & known.sought.again
 
     def judge(self, pair: Pair, known: Judgement) -> Judgement:
         """With what is found."""
@@ -294,6 +331,9 @@ class Seeks(AbstractSearching):
 
 class Settles(AbstractSearching):
     """What becomes of the search of `Thorough`."""
+
+    reads: ClassVar[tuple[str, ...]] = ("decision", "sought")
+    changes: ClassVar[tuple[str, ...]] = (*OF_DECISION, "sought")
 
     def judge(self, pair: Pair, known: Judgement) -> Judgement:
         """With the decision, and whether the search is to begin again."""

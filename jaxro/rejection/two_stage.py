@@ -36,4 +36,5 @@ class TwoStage(AbstractProcedure):
             undecided=two.undecided,
             in_use=two.in_use,
             unchecked=one.unchecked | two.unchecked,
+            rivals=two.rivals,
         )

@@ -18,7 +18,7 @@ out: the deviations of the pose without them are true, whether they are right or
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -32,7 +32,7 @@ from ..geometry.pairs import Pair
 from ..xla.kernels import while_loop
 from ..xla.passes import count
 from .agreement import keep_agreeing
-from .judgement import AbstractStep, Judgement
+from .judgement import OF_DECISION, AbstractStep, Judgement
 from .level import Level
 from .masked import Use, choose
 from .stages import ROUNDS
@@ -62,6 +62,8 @@ class IsChecked(AbstractStep):
     anew by |w| <= limit; where points are out."""
 
     level: Level
+    reads: ClassVar[tuple[str, ...]] = ("decision", "base")
+    changes: ClassVar[tuple[str, ...]] = (*OF_DECISION, "unchecked")
 
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
         carried = ~(known.base.turned | known.base.few)

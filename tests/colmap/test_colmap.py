@@ -234,10 +234,16 @@ def test_older_schema(scene, tmp_path):
     assert query(own, kept) == query(scene[2], kept)
 
 
-def add_pair(database, cameras, rng, points, rotation, base, wrong=0.0):
-    """Two photos of points given in the frame of the first one; x2 = R x1 + t."""
+def add_pair(
+    database, cameras, rng, points, rotation, base, wrong=0.0, moving=(0, None, None)
+):
+    """Two photos of points given in the frame of the first one; x2 = R x1 + t. The first
+    points have an R and t of their own, if so many are `moving`."""
     numbers = []
     moved = points @ rotation.T + base
+    count, own_rotation, own_base = moving
+    if count:
+        moved[:count] = points[:count] @ own_rotation.T + own_base
     for number, at in zip(cameras, (points, moved), strict=True):
         camera = database.read_camera(number)
         pixels = camera.img_from_cam(at) + rng.normal(0, NOISE, (len(at), 2))
@@ -299,10 +305,11 @@ def test_every_pair_gets_what_it_is_worth(tmp_path):
         walls = [add(plane, small, base) for _ in range(4)]
         more = rng.uniform([-2, -2, 4], [2, 2, 9], (LONGEST, 3))
         pairs["longest"] = add(more, turn, base)
+        pairs["several"] = add(cloud, turn, base, moving=(70, small, base))
     result = run(path, "--sigma", NOISE)
     assert (
         result.exit_code == 1
-        and "20 pairs" in result.stdout
+        and "21 pairs" in result.stdout
         and "DEGENERATE" in result.stdout
     )
     with pycolmap.Database.open(str(path)) as database:
@@ -327,6 +334,7 @@ def test_every_pair_gets_what_it_is_worth(tmp_path):
         "none": Config.DEGENERATE,
         "ten": Config.CALIBRATED,
         "longest": Config.CALIBRATED,
+        "several": Config.MULTIPLE,
     }
     sizes = {name: len(g.inlier_matches) for name, g in found.items()}
     assert sizes["chance"] == sizes["few"] == sizes["none"] == 0 and sizes["ten"] == 12
@@ -337,6 +345,7 @@ def test_every_pair_gets_what_it_is_worth(tmp_path):
         and 125 <= sizes["plane"] <= 131
         and sizes["rotation"] >= 156
     )
+    assert sizes["several"] >= 150 and found["several"].cam2_from_cam1 is None
     for name in ("oriented", "ten"):
         pose = found[name].cam2_from_cam1
         assert angle(pose.translation, base) < (0.5 if name == "oriented" else 5)
@@ -606,6 +615,7 @@ def test_every_kind_is_explained():
     assert set(colmap.MEANING) == set(two_view.CONFIG) == set(Kind)
     assert set(two_view.CONTENT) == set(Kind)
     names = {2: "CALIBRATED", 4: "PLANAR", 5: "PANORAMIC", 1: "DEGENERATE"}
+    names |= {8: "MULTIPLE"}
     for kind, config in two_view.CONFIG.items():
         assert colmap.MEANING[kind][1].startswith(names[config])
         assert int(getattr(Config, names[config])) == config
