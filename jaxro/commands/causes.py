@@ -63,9 +63,15 @@ def _accuse_nobody(found: Found, pairs: Ragged, named: list[int]) -> Found:
         "statistic": 0.0,
         "undecided": False,
         "unchecked": False,
+        "rivals": False,
     }
-    put = lambda a, value: np.where(own, np.asarray(value, a.dtype), a)
-    decided = {n: put(np.asarray(found.decided[n]), v) for n, v in innocent.items()}
+
+    def put(a: np.ndarray, value: float) -> np.ndarray:
+        a = np.array(a)
+        a[own] = value
+        return a
+
+    decided = {n: put(found.decided[n], v) for n, v in innocent.items()}
     return found._replace(outcome=outcome, decided=found.decided | decided)
 
 
@@ -207,6 +213,7 @@ def _found_of(pairs: Ragged, found: Found, chosen: Int[np.ndarray, " some"]) -> 
         outcome=None if found.outcome is None else of_chosen(found.outcome),
         decided=found.decided
         and {name: np.asarray(a)[rows] for name, a in found.decided.items()},
+        rivals=jax.tree.map(of_chosen, found.rivals),
     )
 
 

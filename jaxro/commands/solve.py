@@ -116,12 +116,14 @@ class CleanedReader(NamedTuple):
 
 class Found(NamedTuple):
     """The columns of the pairs and, by table, of their points, in the rows of all; of
-    cleaned pairs the outcomes, the columns of a `verdicts.Decision`, and the rounds."""
+    cleaned pairs the outcomes, the columns of a `verdicts.Decision`, those of other
+    consensuses, and the rounds."""
 
     of_pairs: dict[str, Any]
     of_points: dict[str, dict[str, Any]]
     outcome: Int[np.ndarray, " pair"] | None = None
     decided: dict[str, Any] | None = None
+    rivals: dict[str, Any] | None = None
     rounds: Rounds | None = None
 
 
@@ -138,7 +140,7 @@ def solve(
         told_of = _orient(pairs, task, plan, threads, told)
         return Found(*_complete(pairs, *told_of, task, plan, threads))
     cleaned = _clean(pairs, task, plan, threads, told)
-    of_pairs, of_points, outcome, decided, rounds = cleaned
+    of_pairs, of_points, outcome, decided, rivals, rounds = cleaned
     # of unusable points the orientation tells
     use = decided["in_use"] | unusable(decided["kept"], decided["order"])
     every = pairs
@@ -149,7 +151,7 @@ def solve(
         refused = is_usable(of_pairs["result"]) & ~is_usable(result)
         of_pairs["result"] = np.where(refused, result, of_pairs["result"])
     told_of = _complete(pairs, of_pairs, of_points, task, plan, threads)
-    return _of_copies(Found(*told_of, outcome, decided, rounds), every)
+    return _of_copies(Found(*told_of, outcome, decided, rivals, rounds), every)
 
 
 def _of_copies(found: Found, pairs: Ragged) -> Found:
@@ -280,12 +282,14 @@ def _assess_one(oriented: Oriented, *, assessor: Assessor) -> Any:
 
 class Cleaned(NamedTuple):
     """The columns of the pairs and of their points; the outcomes, the decision about
-    every point, and the rounds if they are wanted."""
+    every point, what is told of other consensuses, and the rounds if they are
+    wanted."""
 
     of_pairs: dict[str, Any]
     of_points: dict[str, dict[str, Any]]
     outcome: Int[np.ndarray, " pair"]
     decided: dict[str, Any]
+    rivals: dict[str, Any]
     rounds: Rounds | None = None
 
 
@@ -317,8 +321,8 @@ def _clean(
     if task.rounds:
         of_round = jax.tree.map(lambda a: a[0], of_pair["rounds"])
         rounds = read_rounds(of_round, log)
-    told_of = of_pair["pair"], of_points.pop("points")
-    return Cleaned(*told_of, of_pair["outcome"], of_points, rounds)
+    told_of = of_pair["pair"], of_points.pop("points"), of_pair["outcome"]
+    return Cleaned(*told_of, of_points, of_pair["rivals"], rounds)
 
 
 def _clean_with_rounds(
@@ -357,8 +361,8 @@ def _clean_with_rounds(
     assert whole is not None
     of_pairs, of_points = whole
     rounds = join_rounds([each[k] for k in range(len(each))], pairs.begins[:-1])
-    told_of = of_pairs["pair"], of_points.pop("points")
-    return Cleaned(*told_of, of_pairs["outcome"], of_points, rounds)
+    told_of = of_pairs["pair"], of_points.pop("points"), of_pairs["outcome"]
+    return Cleaned(*told_of, of_points, of_pairs["rivals"], rounds)
 
 
 def _put(everywhere: np.ndarray, places: np.ndarray, values: np.ndarray) -> None:
@@ -417,8 +421,9 @@ def make_results(
 def make_verdicts(table: Table, found: Found) -> Verdicts:
     """The decisions about the points of a table."""
     assert found.outcome is not None and found.decided is not None
+    assert found.rivals is not None
     q = {"q": found.of_points["residuals"]["q"]}
-    return Verdicts(table, found.outcome, found.decided | q, found.rounds)
+    return Verdicts(table, found.outcome, found.decided | q, found.rivals, found.rounds)
 
 
 def is_good(results: Mapping[str, int], outcomes: Mapping[str, int] | None) -> bool:

@@ -1,11 +1,13 @@
 """What a procedure rejected, in what order and on what evidence, on the terminal."""
 
 from collections import defaultdict
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Int
 from rich.console import Console
 
+from ..orientation.pure_rotation import ANGLES
 from .columns import OUTCOME_ADVICE
 from .pair import join_names
 from .rows import left_out, most_rows
@@ -23,6 +25,7 @@ def show(console: Console, verdicts: Verdicts, procedure: str, unit: str) -> Non
     )
     _show_rejections(console, verdicts, verdicts.rejected, unit, many)
     _show_doubts(console, verdicts, many)
+    _show_solutions(console, verdicts, many)
     by_outcome: dict[str, list[str]] = defaultdict(list)
     for name, outcome in zip(names, verdicts.outcomes, strict=True):
         by_outcome[outcome].append(name)
@@ -49,6 +52,8 @@ def show_one(console: Console, verdicts: Verdicts, pair: int, unit: str) -> None
     doubtful = verdicts.undecided
     if pair in doubtful:
         say(console, _doubt(doubtful[pair]))
+    for said in _solutions(verdicts, pair):
+        say(console, said)
 
 
 def _show_rejections(
@@ -98,6 +103,35 @@ def _show_doubts(console: Console, verdicts: Verdicts, many: bool) -> None:
         of = f"{names[pair]}: " if many else ""
         say(console, of + _doubt(doubtful[pair]))
     left_out(console, len(doubtful), "undecided pairs")
+
+
+def _show_solutions(console: Console, verdicts: Verdicts, many: bool) -> None:
+    """The solutions, by pair, where there are several."""
+    found, names = verdicts.solutions, verdicts.table.names
+    for pair in list(found)[: most_rows()]:
+        of = f"{names[pair]}: " if many else ""
+        for said in _solutions(verdicts, pair):
+            say(console, of + said)
+    left_out(console, len(found), "pairs with several solutions")
+
+
+def _solutions(verdicts: Verdicts, pair: int) -> Iterator[str]:
+    """A sentence on each of several solutions."""
+    for number_of, (rows, pose, probability) in enumerate(
+        verdicts.solutions.get(pair, [])
+    ):
+        points = list(verdicts.table.points[rows])
+        bx, by, bz, *angles = pose.values()
+        base = ", ".join(number(b, 3) for b in (bx, by, bz))
+        turned = zip(ANGLES, angles, strict=True)
+        named = ", ".join(f"{name} {number(angle, 2)}°" for name, angle in turned)
+        which = (
+            f"others: {join_names(points, most_rows())}" if number_of else "those kept"
+        )
+        yield (
+            f"{len(points)} points agree with base ({base}), {named}; by accident with "
+            f"the probability {probability:.1g}; {which}."
+        )
 
 
 def _doubt(points: list[str]) -> str:

@@ -274,6 +274,7 @@ CLEANED = (
     Column("verdict", names=VERDICTS, only="csv"),
     Column("kept", only="parquet"),
     Column("undecided", only="parquet"),
+    Column("other_solution", only="parquet"),
     Column("order"),
     Column("statistic", infinity="inf"),
     Column("limit"),

@@ -9,28 +9,32 @@ decisions.csv, decisions.json.
   iteration and no decision.
 * decisions.json: the procedure with its tolerances; of each pair the outcome, the
   points in the order of rejection (those of one list went together), those of them
-  that fit but that no other point checks, the undecided points and the elements by
-  round.
+  that fit but that no other point checks, the undecided points, the elements by
+  round, and, where other points agree with another pose, all solutions: of each its
+  points, its pose, and the probability that they agree by accident.
 
 What a statistic is, and its unit, says the procedure; inf: wrong by any measure. A
 point that `recommended` rejected with a statistic below its limit fits, but no other
 point checks it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry.elements import IndependentElements
+from ..orientation.pure_rotation import ANGLES
 from ..rejection import Rejection
 from ..tables.measured import Table, take
 from .columns import CLEANED, OUTCOME_ADVICE, OUTCOME_NAMES, ROUNDS, Column, Units
 from .files import json_text, table_text
+from .reader import report_numbers
 
 Either = Array | np.ndarray
 
@@ -46,6 +50,7 @@ class Decision(NamedTuple):
     undecided: Bool[Either, "point"]
     in_use: Bool[Either, "point"]
     unchecked: Bool[Either, "point"]
+    rivals: Bool[Either, "point rival"]
     outcome: Int[Either, ""]
 
 
@@ -67,6 +72,7 @@ def decision(found: Rejection) -> Decision:
         undecided=found.undecided,
         in_use=found.in_use,
         unchecked=found.unchecked,
+        rivals=found.rivals.mask.T,
         outcome=found.outcome._value,
     )
 
@@ -78,9 +84,16 @@ def unusable(kept: Either, order: Either) -> Either:
 
 
 def without_log(found: Rejection) -> tuple[Any, dict[str, Any]]:
-    """The outcome of a pair; the decision about every point."""
+    """The outcome of a pair, and what is told of its consensuses; the decision about every
+    point."""
     of_points = decision(found)._asdict()
-    return {"outcome": of_points.pop("outcome")}, of_points
+    rivals, own = found.rivals, found.orientation.pose
+    poses = jax.tree.map(lambda a, b: jnp.append(a, b), own, rivals.pose)
+    told = {
+        "probability": jnp.append(rivals.own, rivals.probability),
+        "pose": jax.vmap(report_numbers)(poses, poses),
+    }
+    return {"outcome": of_points.pop("outcome"), "rivals": told}, of_points
 
 
 def with_log(found: Rejection) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -130,17 +143,28 @@ def join_rounds(each: Sequence[Rounds], begins: Int[np.ndarray, " pair"]) -> Rou
     )
 
 
+class Solution(NamedTuple):
+    """A consensus of a pair: its points, its pose (numbers by name: the unit base, angles
+    in degrees), and the probability that they agree by accident."""
+
+    rows: Int[np.ndarray, " some"]
+    pose: dict[str, float]
+    probability: float
+
+
 @dataclass(frozen=True)
 class Verdicts:
     """Pairs with the decision about their points, all of which `table` holds.
 
     `outcome`: numbers of `OUTCOMES`. `of_points`: the columns of a `Decision`, and q,
-    the y-parallax at the orientation of the points kept. `rounds`: if asked for.
+    the y-parallax at the orientation of the points kept. `rivals`: the columns of the
+    consensuses, which `without_log` tells. `rounds`: if asked for.
     """
 
     table: Table
     outcome: Int[np.ndarray, " pair"]
     of_points: dict[str, np.ndarray]
+    rivals: dict[str, np.ndarray]
     rounds: Rounds | None = None
 
     @cached_property
@@ -165,6 +189,26 @@ class Verdicts:
             )
         return named
 
+    @cached_property
+    def solutions(self) -> dict[int, list[Solution]]:
+        """By the number of the pair its solutions, the points kept first; of pairs that
+        have more than this one."""
+        owners, of_rival = self.table.owners, self.of_points["rivals"]
+        pairs = np.unique(owners[np.any(of_rival, axis=1)]).tolist()
+        return {pair: list(self._solutions(pair)) for pair in pairs}
+
+    def _solutions(self, pair: int) -> Iterator[Solution]:
+        names = "bx", "by", "bz", *(f"{angle}_deg" for angle in ANGLES)
+        every = [self.of_points["kept"], *self.of_points["rivals"].T]
+        for number, use in enumerate(every):
+            rows = np.flatnonzero(use & (self.table.owners == pair))
+            if rows.size:
+                pose = self.rivals["pose"][pair, number].tolist()
+                named = dict(zip(names, pose, strict=True))
+                yield Solution(
+                    rows, named, float(self.rivals["probability"][pair, number])
+                )
+
     def written(self) -> tuple[Sequence[Column], dict[str, Any]]:
         """The columns of the table of every row with its verdict, and their values."""
         table, found = self.table, self.of_points
@@ -175,8 +219,19 @@ class Verdicts:
             **table.photos_of_rows,
             "point": table.points,
             "verdict": np.where(kept & found["undecided"], 2, kept.astype(int)),
+            "other_solution": self._other_solution,
         }
         return CLEANED, table.numbers | found | values | {"order": order}
+
+    @property
+    def _other_solution(self) -> Int[np.ndarray, " row"]:
+        """Of every row the number of the other solution that it belongs to, -1 for
+        none."""
+        of_rival = self.of_points["rivals"]
+        number = np.full(len(of_rival), -1, np.int32)
+        rows, which = np.nonzero(of_rival)
+        number[rows] = which + 1
+        return number
 
 
 def texts(verdicts: Verdicts, units: Units, summary: dict[str, Any]) -> dict[str, str]:
@@ -230,6 +285,14 @@ def _summary(verdicts: Verdicts, number: int) -> dict[str, Any]:
         "order": list(together.values()),
         "unchecked": _names(table, rejected[verdicts.of_points["unchecked"][rejected]]),
         "undecided": verdicts.undecided.get(number, []),
+        "solutions": [
+            {
+                "points": _names(table, one.rows),
+                "probability": one.probability,
+                "elements": one.pose,
+            }
+            for one in verdicts.solutions.get(number, [])
+        ],
         "elements": [
             {"round": k, **dict(zip(names, np.rad2deg(values).tolist(), strict=True))}
             for k, values in enumerate(by_round, 1)

@@ -7,6 +7,7 @@ import math
 import command_line
 import numpy as np
 import pytest
+import scenes
 from bad_tables import write
 from command_line import rows, words
 
@@ -372,6 +373,45 @@ def test_points_that_nothing_tells_apart_are_named(tmp_path):
         ["a", "b", "e", "f"],
         [],
     )
+
+
+@pytest.fixture(scope="module")
+def two_scenes(tmp_path_factory):
+    """A table of a pair of photographs with two scenes and one with one, and how to clean
+    it."""
+    parts = scenes.two_scenes(1, 50, 40, 100, seed=1), scenes.photographs(1, 84, 0.5)
+    lines = ["pair,point,x_left,y_left,x_right,y_right"]
+    focal = float(parts[0].focal[0])
+    for name, part in zip(("two", "one"), parts, strict=True):
+        photos = np.stack(part.coordinates)[:, 0] * focal / part.focal[0]
+        numbers = enumerate(photos.T.tolist(), 1)
+        lines += [f"{name},{k}," + ",".join(map(repr, xy)) for k, xy in numbers]
+    path = write(tmp_path_factory.mktemp("two"), "\n".join(lines), "two.csv")
+    return path, ["--focal", repr(focal), "--sigma", "1"]
+
+
+def test_several_solutions_are_told_with_their_points(two_scenes, tmp_path):
+    """In words, in the JSON and on the page of the report: the pair is not usable."""
+    table, how = two_scenes
+    out, page = tmp_path / "out", tmp_path / "report.html"
+    result = run(table, *how, "--out", out, "--report", page)
+    assert result.exit_code == 1, result.stderr
+    told, said = words(result.stdout), "points agree with base ("
+    assert told.count(said) == 2 and "several_solutions (1: two)" in told
+    assert words(page.read_text()).count(said) == 2
+    two, one = json.loads((out / "decisions.json").read_text())["pairs"]
+    assert one["solutions"] == []
+    kept, other = two["solutions"]
+    assert f"two: {len(kept['points'])} {said}" in told
+    assert f"two: {len(other['points'])} {said}" in told
+    rejected = {point for points in two["order"] for point in points}
+    assert set(other["points"]) < rejected and not set(kept["points"]) & rejected
+    assert len(kept["points"]) >= 45 and len(other["points"]) >= 25
+    assert 0 < kept["probability"] < other["probability"] < 1e-3
+    base = [other["elements"][name] for name in ("bx", "by", "bz")]
+    assert np.linalg.norm(base) == pytest.approx(1)
+    usable = json.loads((out / "summary.json").read_text())["pairs"]
+    assert [pair["result"] for pair in usable] == ["several_solutions", "successful"]
 
 
 @pytest.mark.slow

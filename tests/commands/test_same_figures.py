@@ -20,7 +20,7 @@ FOCAL = 100.0
 COUNTS = {"one": 1, "few": 3, "many": 70}
 TABLES = ("elements", "residuals", "points", "reliability")
 TEXTS = {"pair", "point", "result", "causes"}
-ONLY_PARQUET = {"used", "outcome", "kept", "undecided"}
+ONLY_PARQUET = {"used", "outcome", "kept", "undecided", "other_solution"}
 ONLY_CSV = {"advice", "verdict", *(f"control_{c}" for c in COORDINATES)}
 PART_ROWS = 200
 
