@@ -18,7 +18,7 @@ What procedures share, from the bottom up:
 * evidence, noise, fading: whether points agree by chance, the noise of their residuals,
   and their weights where this is not normal
 * stages, quick, thorough: the stages of `Recommended`
-* carried, unchecked, rivals: what is asked of the pose that it believes
+* homographies, carried, unchecked, rivals: what is asked of the pose that it believes
 """
 
 from ..adjustment import losses

@@ -9,6 +9,8 @@ hypothesis that the points that it needs are wrong ones, which agree with it by 
 * without its carriers: when the points with the largest influence on the worst
   determined direction are taken away, one after the other, the rest determines the pose
   no more than points that determine nothing;
+* off a plane: all other points lie in one plane, whose pose then is that of these points
+  alone;
 * by the other pose of a plane: it explains all other points.
 
 With s such points among w that the others do not vouch for, and the chance p that a
@@ -36,10 +38,11 @@ from ..orientation.orient import Orientation
 from ..orientation.results import RESULTS
 from ..orientation.starts.general import rotation_only, vectors
 from ..orientation.verdict import WEAK, largest_variance
-from ..xla.kernels import while_loop
+from ..xla.kernels import if_needed, while_loop
 from ..xla.passes import count
 from .agreement import keep_agreeing, points_within, squares
 from .evidence import chance_of_agreement
+from .homographies import points_in_plane
 from .judgement import OF_DECISION, AbstractStep, Judgement, Witnesses
 from .level import Level
 from .masked import Use, choose, sum_of
@@ -78,11 +81,12 @@ PARALLEL = 3.5
 
 class IsCarried(AbstractStep):
     """Whether a rotation explains all points but few, which then is the pose, with all
-    points that it explains; or else whether few points carry the base."""
+    points that it explains; or else whether few points carry the base, and whether all
+    but few lie in one plane, which then alone give the pose."""
 
     level: Level
     reads: ClassVar[tuple[str, ...]] = ("decision",)
-    changes: ClassVar[tuple[str, ...]] = (*OF_DECISION, "base")
+    changes: ClassVar[tuple[str, ...]] = (*OF_DECISION, "base", "unchecked")
 
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
         return known.decision.believed
@@ -109,17 +113,26 @@ class IsCarried(AbstractStep):
         few = found & _by_accident(count(needed), count(needed | out), chance, 2)
 
         plane = planes.plane(pair, pose, use, limit)
+        off = use & ~points_in_plane(pair, use, limit)
+        some_off = (count(off) > 0) & (count(off) <= FEW) & any_out & ~turned
+
+        def in_plane(needed: Bool[Array, ""]) -> tuple[RelativePose, Use]:
+            others = pair.with_mask(pair.mask & ~off & needed)
+            return keep_agreeing(others, pose, use & ~off, limit, ROUNDS)
+
         base = Witnesses(
             turned=turned,
             few=few & any_out & ~turned,
-            flat=(plane.share >= FLAT) & any_out & ~turned,
+            flat=some_off | ((plane.share >= FLAT) & any_out & ~turned),
             second=any_out & False,
             chance=chance,
         )
+        pose, use = if_needed(some_off, in_plane, (pose, use))
         decision = known.decision._replace(
             pose=choose(turned, rotation, pose), use=jnp.where(turned, still, use)
         )
-        return known.decided(pair, decision)._replace(base=base)
+        known = known.decided(pair, decision)
+        return known._replace(base=base, unchecked=off & some_off)
 
 
 class HasSecond(AbstractStep):

@@ -62,7 +62,7 @@ class IsChecked(AbstractStep):
     anew by |w| <= limit; where points are out."""
 
     level: Level
-    reads: ClassVar[tuple[str, ...]] = ("decision", "base")
+    reads: ClassVar[tuple[str, ...]] = ("decision", "base", "unchecked")
     changes: ClassVar[tuple[str, ...]] = (*OF_DECISION, "unchecked")
 
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
@@ -76,7 +76,8 @@ class IsChecked(AbstractStep):
         pair, limit = self.level.judged_by(pair, scale), self.level.limit(pair)
         found = without_unchecked(pair, pose, use, limit, known.base.chance)
         decision = known.decision._replace(pose=found.pose, use=found.use)
-        return known.decided(pair, decision)._replace(unchecked=found.unchecked)
+        unchecked = known.unchecked | found.unchecked
+        return known.decided(pair, decision)._replace(unchecked=unchecked)
 
 
 class Checked(NamedTuple):
