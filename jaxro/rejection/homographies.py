@@ -62,11 +62,13 @@ def _transfer_errors(
         rot.dot(s, tuple(right[3])) / _safe(rot.dot(r, tuple(left[3])))
         for r, s in zip(before, after, strict=True)
     ]
-    parts = list(zip(share, before, right[:3], strict=True))
+    first, second, third = (tuple(corner) for corner in right[:3])
+    to_right = rot.transpose((first, second, third))
 
     def of_point(x1, y1, x2, y2, sigma):
         p = x1 / pair.focal_left, y1 / pair.focal_left, -jnp.ones_like(x1)
-        across, along, away = sum(q * (c * rot.dot(r, p)) for c, r, q in parts)
+        u, v, w = (k * rot.dot(r, p) for k, r in zip(share, before, strict=True))
+        across, along, away = rot.apply(to_right, (u, v, w))
         dx, dy = (-pair.focal_right * v / _safe(away) for v in (across, along))
         square = ((dx - x2) ** 2 + (dy - y2) ** 2) / (2 * sigma**2)
         return jnp.where(jnp.isfinite(square), square, jnp.inf)
