@@ -7,7 +7,7 @@ no fit tells apart.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -185,13 +185,31 @@ def _are_degrees(at: Known) -> bool:
 
 
 def _in_metres(at: Known, east: int, north: int) -> Known:
-    """Longitudes and latitudes in metres about their middle, by the radii of the
-    ellipsoid there."""
-    turned = np.radians(at)
-    middle = np.nanmean(turned, axis=0)
+    """Longitudes, latitudes and heights in metres, in the plane that touches the ellipsoid
+    in their middle. Heights without a place in the plane are unknown."""
+    longitude, latitude = np.radians(at[:, [east, north]].T)
+    longitude = longitude - np.nanmean(longitude)
+    middle = np.nanmean(latitude)
     square = FLATTENING * (2 - FLATTENING)
-    bent = 1 - square * np.sin(middle[north]) ** 2
-    across = AXIS / np.sqrt(bent) * np.cos(middle[north])
-    along = AXIS * (1 - square) / bent**1.5
-    away = turned - middle
-    return np.stack([away[:, east] * across, away[:, north] * along, at[:, 2]], axis=1)
+
+    def from_centre(latitude: Any, height: Any) -> tuple[Any, Any]:
+        """Distances from the axis of the earth, and from its equator."""
+        across = AXIS / np.sqrt(1 - square * np.sin(latitude) ** 2)
+        return (
+            (across + height) * np.cos(latitude),
+            (across * (1 - square) + height) * np.sin(latitude),
+        )
+
+    heights = np.where(np.isfinite(at[:, 2]), at[:, 2], 0.0)
+    from_axis, from_equator = from_centre(latitude, heights)
+    axis, equator = from_centre(middle, 0.0)
+    away, along = from_axis * np.cos(longitude) - axis, from_equator - equator
+    up = np.cos(middle) * away + np.sin(middle) * along
+    return np.stack(
+        [
+            from_axis * np.sin(longitude),
+            np.cos(middle) * along - np.sin(middle) * away,
+            np.where(np.isfinite(at[:, 2]), up, np.nan),
+        ],
+        axis=1,
+    )

@@ -62,6 +62,8 @@ class Hypothesis(NamedTuple):
     say: Callable[[Outcome], str]
     unknowns: int = 0
     factor: float = 1.0
+    margin: float = MARGIN
+    """By more than this D falls, if it is the cause."""
 
     @property
     def of_ground(self) -> bool:
@@ -83,7 +85,7 @@ def find_cause(
     `ground_alone`: without hypotheses about cameras and standard deviations, which
     compile programs of their own."""
     usual = np.inf if outcome is None else _deviance(given, outcome, 0, 1.0)
-    best, found = usual - MARGIN, None
+    best, found = usual, None
     for one in _hypotheses(given, chained, outcome, level, sigma_known, ground_alone):
         tried = _adjust(one.given, chained, level)
         if tried is None or tried.adjusted.result != RESULTS.successful:
@@ -92,7 +94,8 @@ def find_cause(
         left = contradictions(
             one.given, tried.adjusted, tried.wrong, sigma_known=sigma_known
         )
-        is_better = one.of_ground or cost < BETTER * usual
+        is_better = cost < usual - one.margin
+        is_better &= one.of_ground or cost < BETTER * usual
         if cost < best and is_better and tried.wrong.settled and not left:
             best, found = cost, (Cause(one.name, one.say(tried)), tried)
             if one.of_ground and cost < CLEARLY * _coordinates(given):
@@ -296,6 +299,9 @@ def _say_single(given: Given, found: Outcome, k: int, level: float) -> str:
 UNITS = ((1000.0, "millimetres"), (100.0, "centimetres"), (1 / 0.3048, "feet"))
 """How often a length in another unit is larger than in metres."""
 
+BAR_UNIT = "bar_unit"
+"""The hypothesis that some bars are in another unit."""
+
 
 def _of_bars(given: Given, outcome: Outcome | None) -> Iterator[Hypothesis]:
     """Bars that do not fit, in another unit."""
@@ -313,11 +319,13 @@ def _of_bars(given: Given, outcome: Outcome | None) -> Iterator[Hypothesis]:
                 for k in np.flatnonzero(wrong)
             )
             yield Hypothesis(
-                "bar_unit",
+                BAR_UNIT,
                 given._replace(bars=given.bars._replace(length=length)),
                 lambda _, named=named, of=of: (
                     f"The length of the scale bar {named} is in {of}: so everything fits"
                 ),
+                # a wrong length hardly fits in another unit by chance
+                margin=CUT / 2,
             )
 
 
@@ -355,6 +363,9 @@ def _figures(adjusted: BlockAdjustment) -> str:
 
 OF_MEASUREMENT = (*(name for _, name, _ in CAMERA), "sigma")
 """The names of hypotheses about how was measured."""
+
+HARMLESS = (*OF_MEASUREMENT, BAR_UNIT)
+"""Those beside which the numbers may be used, if they hardly move a point."""
 
 SPREAD = 1.4826
 """A normal standard deviation over the median of its absolute values."""

@@ -19,13 +19,14 @@ from .chain import Chained, Oriented, Unjoined, chain, models_of
 from .columns import Cause
 from .components import Component
 from .confusable import tell_confusable
-from .contest import OF_MEASUREMENT, find_cause, is_misplaced
+from .contest import HARMLESS, find_cause, is_misplaced
 from .contradictions import contradictions, is_suspicious, stands_under_ground
+from .exchanged import tell_exchanged
 from .given import Given, Wrong
 from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, from_pairs
-from .moved_names import NEARLY_ALL, find_moved
 from .place import Placed, TooLittleControl
+from .wrong_photo import NEARLY_ALL, mend_photo
 
 MOVED = 3.0
 """Deviations of a point by which a cause moves it at most, if the numbers without the
@@ -123,7 +124,7 @@ def adjust_and_judge(
             outcome.adjusted
         )
         if not (suspicious or of_ground or is_misplaced(given, chained)):
-            return Judged(outcome, cause=tell_confusable(given, outcome, level))
+            return Judged(outcome, cause=_of_points(given, outcome, level))
     cause, explained = _of_field(given.block), None
     if cause is None:
         found = find_cause(
@@ -141,12 +142,17 @@ def adjust_and_judge(
         raise refused
     rest = given, outcome.adjusted, outcome.wrong
     against = contradictions(*rest, sigma_known=sigma_known)
-    if cause is not None and cause.name in OF_MEASUREMENT and not against:
+    if cause is not None and cause.name in HARMLESS and not against:
         untrue = explained is not None and _is_moved(outcome, explained)
         cause = cause._replace(is_hint=not untrue)
     if cause is None and not against:
-        cause = tell_confusable(given, outcome, level)
+        cause = _of_points(given, outcome, level)
     return Judged(outcome, tuple(against), cause)
+
+
+def _of_points(given: Given, outcome: Outcome, level: float) -> Cause | None:
+    """What is wrong with single points of a block that fits as a whole."""
+    return tell_confusable(given, outcome, level) or tell_exchanged(outcome.adjusted)
 
 
 def _is_moved(outcome: Outcome, explained: Outcome) -> bool:
@@ -186,7 +192,7 @@ def _of_field(block: MeasuredBlock) -> Cause | None:
 
 class Joined(NamedTuple):
     """The photos of a block chained by their pairs, which of these could be oriented,
-    and what is wrong with the names of a photo: the block then has the right ones."""
+    and what is wrong with a photo as a whole: the block then has it as it should be."""
 
     block: MeasuredBlock
     chained: Chained
@@ -202,15 +208,9 @@ def join_pairs(
     number = {name: k for k, name in enumerate(block.photos)}
     ends = [np.array([number[name] for name in side], int) for side in (left, right)]
     oriented, cause = _orient(pairs), None
-    moved = find_moved(block, *ends, oriented, _orient)
-    if moved is not None:
-        block, oriented = moved.block, moved.oriented
-        cause = Cause(
-            "names_moved",
-            f"On photo {moved.photo} each place has the name of the row before or after "
-            f"it: moved by one row {moved.fitting} of the {moved.points} points of its "
-            "pairs fit",
-        )
+    mended = mend_photo(block, *ends, oriented, _orient)
+    if mended is not None:
+        block, oriented, cause = mended
     try:
         chained = chain(block, models_of(*ends, oriented))
     except Unjoined:

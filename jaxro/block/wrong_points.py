@@ -124,7 +124,7 @@ def decide(
     numbers = np.unique(block.point[wrong])
     if not len(numbers):
         return out
-    read = _reader(adjusted)
+    read = reader_of(adjusted)
     order = np.argsort(block.point, kind="stable")
     begins, ends = (
         np.searchsorted(block.point[order], at) for at in (numbers, numbers + 1)
@@ -163,7 +163,7 @@ def _without(rays: int, some: tuple[int, ...]) -> Bool[np.ndarray, " ray"]:
     return kept
 
 
-def _reader(
+def reader_of(
     adjusted: BlockAdjustment,
 ) -> Callable[[int, Int[np.ndarray, " ray"]], _Point]:
     """What reads a point of the adjustment and its rays."""

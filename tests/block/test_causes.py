@@ -18,6 +18,7 @@ from jaxro.block.contradictions import (
     is_suspicious,
     stands_under_ground,
 )
+from jaxro.block.exchanged import find_exchanged
 from jaxro.block.orient_block import adjust_and_judge
 from jaxro.block.photos import find_copies, find_held
 from jaxro.block.wrong_points import decide
@@ -57,9 +58,35 @@ def cause_of(mock, given):
 
 
 def in_degrees(at):
-    """Longitude and latitude of a plane on an ellipsoid, near enough."""
-    away = (at[:, :2] - PLACE[:2]) / [111_320 * np.cos(np.radians(41)), 111_050]
-    return np.column_stack([9 + away[:, 0], 41 + away[:, 1], at[:, 2]])
+    """Longitude, latitude and height of points of a plane that touches the ellipsoid at
+    9 and 41 degrees, in the middle of the block: by differences of its equation, inverted
+    by Newton's method."""
+    square = (2 - 1 / 298.257) / 298.257
+
+    def from_centre(places):
+        (east, north), up = np.radians(places[:2]), places[2]
+        n = 6_378_137.0 / np.sqrt(1 - square * np.sin(north) ** 2)
+        over = (n + up) * np.cos(north)
+        z = (n * (1 - square) + up) * np.sin(north)
+        return np.array([over * np.cos(east), over * np.sin(east), z])
+
+    middle = np.array([9.0, 41.0, 0.0])
+    (lon, lat), origin = np.radians(middle[:2]), from_centre(middle)
+    up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+    axes = np.stack([east, np.cross(up, east), up])
+    found = []
+    for place in (at - at.mean(axis=0)) * [1, 1, 0] + at * [0, 0, 1]:
+        here, steps = middle, np.diag([1e-5, 1e-5, 1.0])
+        for _ in range(5):
+            slopes = [
+                (from_centre(here + d) - from_centre(here - d)) / (2 * d.max())
+                for d in steps
+            ]
+            off = origin + place @ axes - from_centre(here)
+            here = here + np.linalg.solve(np.array(slopes).T, off)
+        found.append(here)
+    return np.array(found)
 
 
 @pytest.mark.parametrize(
@@ -205,6 +232,28 @@ def test_a_bar_is_judged_by_the_block_without_it():
     assert contradictions(both, found.adjusted, found.wrong)
 
 
+@pytest.mark.slow
+def test_a_bar_in_another_unit_is_named_beside_good_numbers():
+    """One of three, which is left out; the unit is a hint, as no point moves without the
+    bar. A length that no unit explains has no cause."""
+    mock, given = strip()
+    at = dict(zip(mock.block.points, mock.points, strict=True))
+    one, other = ["t20", "t25", "t30"], ["t40", "t38", "t46"]
+    length = np.array(
+        [np.linalg.norm(at[a] - at[b]) for a, b in zip(one, other, strict=True)]
+    )
+    for factor, name in ((1000, "bar_unit"), (1.01, None)):
+        lengths = bars(one, other, length * [1, factor, 1], 0.05)
+        found = adjust_and_judge(given._replace(bars=lengths), mock.photos)
+        assert found.outcome.wrong.bars.tolist() == [False, True, False]
+        assert not found.contradictions
+        assert (found.cause and found.cause.name) == name
+        if found.cause is not None:
+            assert found.cause.is_hint and "t25-t38 is in millimetres" in (
+                found.cause.sentence
+            )
+
+
 def test_rays_that_cannot_be_told_apart_are_left_out_together():
     """A parallax of a point on two photos is in either of them; among four rays the wrong
     one is found."""
@@ -225,6 +274,23 @@ def test_rays_that_cannot_be_told_apart_are_left_out_together():
         assert out[rays[0]] and np.sum(out) == (1 if alone else number)
 
 
+def test_exchanged_points_are_named_beside_good_numbers():
+    """Two points that three photos show each; they are left out on one photo."""
+    mock, given = strip()
+    measured = mock.block
+    photos = np.bincount(measured.point, minlength=len(measured.points))
+    own = np.flatnonzero((measured.photo == 3) & (photos[measured.point] == 3))
+    one, other = own[[1, 4]]
+    point = measured.point.copy()
+    point[[one, other]] = point[[other, one]]
+    given = given._replace(block=measured._replace(point=point))
+    found = adjust_and_judge(given, mock.photos)
+    names = sorted(measured.points[measured.point[k]] for k in (one, other))
+    assert find_exchanged(found.outcome.adjusted) == {tuple(names): ["1-4"]}
+    assert found.cause is not None and found.cause.is_hint
+    assert all(name in found.cause.sentence for name in (*names, "1-4"))
+
+
 def test_hypotheses_undo_what_they_name():
     """On numbers alone."""
     rng = np.random.default_rng(1)
@@ -243,8 +309,9 @@ def test_hypotheses_undo_what_they_name():
     metres = [
         one for one in alter(in_degrees(at), every, "points") if one.name == "degrees"
     ]
-    found = metres[0].coordinates
-    np.testing.assert_allclose(found - found[0], at - at[0], atol=3)
+    apart = metres[0].coordinates - metres[0].coordinates.mean(axis=0)
+    # planes that touch the ellipsoid at places some metres apart differ by a turn
+    np.testing.assert_allclose(apart, at - at.mean(axis=0), atol=0.01)
 
 
 def test_a_photo_under_two_names_and_one_that_a_point_holds_are_told():

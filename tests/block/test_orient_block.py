@@ -318,17 +318,36 @@ def test_swapped_names_in_a_hundred_blocks():
     assert hits >= 95
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("step", [1, -1])
-def test_names_moved_by_one_row_on_a_photo_are_named(step):
+def with_names_moved(given, own, step):
     """Each place of a photo has the name of the row before, or of the next one."""
-    mock = block.mock_block(5, block.Flight(models=4), control_every=2)
-    given, point = mock.block, mock.block.point.copy()
-    own = np.flatnonzero(given.photo == 2)
+    point = given.point.copy()
     own = own[np.argsort([given.points[k] for k in point[own]])]
     point[own] = np.roll(point[own], step)
-    found = orient_block(*block.pairs_of(given._replace(point=point)), mock.ground)
-    assert found.cause is not None and found.cause.name == "names_moved"
+    return given._replace(point=point)
+
+
+def with_y_downwards(given, own):
+    y = given.y.copy()
+    y[own] = -y[own]
+    return given._replace(y=y)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("names_moved", lambda *some: with_names_moved(*some, 1)),
+        ("names_moved", lambda *some: with_names_moved(*some, -1)),
+        ("photo_mirrored", with_y_downwards),
+    ],
+)
+def test_a_photo_that_is_wrong_as_a_whole_is_named(name, change):
+    """And the block adjusted as it would be right."""
+    mock = block.mock_block(5, block.Flight(models=4), control_every=2)
+    given = mock.block
+    own = np.flatnonzero(given.photo == 2)
+    found = orient_block(*block.pairs_of(change(given, own)), mock.ground)
+    assert found.cause is not None and found.cause.name == name
     assert given.photos[2] in found.cause.sentence
     adjusted = found.adjusted
     assert adjusted.result == RESULTS.successful and not np.any(found.wrong.rays[own])

@@ -1,14 +1,14 @@
-"""A photo on which each place has the name of the row before or after it.
+"""A photo that is wrong as a whole: each place has the name of the row before or after
+it, or it is the mirror image of a photo.
 
 Such a photo fits no other one, and no place of it is worse than the rest. Under each
-hypothesis the names are moved by one row, of the list in which they came or of the list
-by name, and the pairs of the photo are oriented anew: where nearly all of their points
-fit then, and few did before, the names are the cause. Of places in a list of no order
-nothing is found.
+hypothesis the pairs of the photo are oriented anew: where nearly all of their points fit
+then, and few did before, it is the cause. Names are moved by one row of the list in which
+they came, or of the list by name; of places in a list of no order nothing is found.
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
@@ -17,13 +17,14 @@ from jaxtyping import Int, Shaped
 
 from ..batches.ragged import Ragged
 from .chain import Oriented
+from .columns import Cause
 from .measured_block import MeasuredBlock, pairs_of_rays
 
-FEW = 0.5
-"""Part of the points of a photo's pairs up to which its names may be wrong."""
+FEW = 0.7
+"""Part of the points of a photo's pairs up to which the photo may be wrong."""
 
 NEARLY_ALL = 0.8
-"""Part of them that has to fit when the names are moved; and part of the points of a
+"""Part of them that has to fit under a hypothesis; and part of the points of a
 refused pair with which it joins photos that nothing else joins."""
 
 FEWEST = 8
@@ -33,42 +34,40 @@ TRIED = 2
 """Photos that are tried."""
 
 
-class Moved(NamedTuple):
-    """A photo whose names are moved: the block with its right names, all pairs oriented
-    with them, and how many of the points of its pairs fit."""
+class Mended(NamedTuple):
+    """The block with a photo as it should be, all pairs oriented with it, and the
+    cause."""
 
-    photo: str
     block: MeasuredBlock
     oriented: Oriented
-    fitting: int
-    points: int
+    cause: Cause
 
 
-def find_moved(
+def mend_photo(
     block: MeasuredBlock,
     left: Int[np.ndarray, " pair"],
     right: Int[np.ndarray, " pair"],
     oriented: Oriented,
     orient: Callable[[Ragged], Oriented],
-) -> Moved | None:
-    """The photo whose names are moved by one row, None where there is none. `left`,
-    `right`: the photos of the pairs, whose names are `block`'s; `orient`: how pairs are
-    oriented."""
+) -> Mended | None:
+    """The block without what is wrong with one photo as a whole, None where nothing is.
+    `left`, `right`: the photos of the pairs, whose names are `block`'s; `orient`: how
+    pairs are oriented."""
     for photo in _suspects(len(block.photos), left, right, oriented):
         own = np.flatnonzero((left == photo) | (right == photo))
-        for names in _moved(block, photo):
-            moved = block._replace(point=names)
+        for mended, name, said in _hypotheses(block, photo):
             ends = zip(left[own].tolist(), right[own].tolist(), strict=True)
-            rows = [_common(moved, one, other) for one, other in ends]
+            rows = [_common(mended, one, other) for one, other in ends]
             begins = np.cumsum([0, *map(len, rows)])
             rays = np.concatenate(rows).T
-            pairs = pairs_of_rays(moved, begins, *rays, left[own], right[own])
+            pairs = pairs_of_rays(mended, begins, *rays, left[own], right[own])
             found = orient(pairs)
             fitting = int(np.sum(np.where(found.usable, found.kept, 0)))
             points = len(rays[0])
             if fitting > NEARLY_ALL * points:
+                told = f"{said} {fitting} of the {points} points of its pairs fit"
                 every = _replace(oriented, own, found)
-                return Moved(block.photos[photo], moved, every, fitting, points)
+                return Mended(mended, every, Cause(name, told))
     return None
 
 
@@ -87,6 +86,28 @@ def _suspects(
     part = np.where(of_photo(points) >= FEWEST, part, np.inf)
     worst = np.argsort(part, kind="stable")[:TRIED]
     return worst[part[worst] <= FEW].tolist()
+
+
+def _hypotheses(
+    block: MeasuredBlock, photo: int
+) -> Iterator[tuple[MeasuredBlock, str, str]]:
+    """The block as it would be right, the name of what is wrong, and how a sentence on it
+    begins."""
+    name = block.photos[photo]
+    y = np.where(block.photo == photo, -block.y, block.y)
+    yield (
+        block._replace(y=y),
+        "photo_mirrored",
+        f"Photo {name} is the mirror image of a photo: its x and y are exchanged, or one "
+        "of its axes counts the other way; mirrored",
+    )
+    for point in _moved(block, photo):
+        yield (
+            block._replace(point=point),
+            "names_moved",
+            f"On photo {name} each place has the name of the row before or after it: "
+            "moved by one row",
+        )
 
 
 def _moved(block: MeasuredBlock, photo: int) -> list[Int[np.ndarray, " ray"]]:
