@@ -14,6 +14,10 @@ from ..tables.network import Measurement
 from .documents import show_json
 from .network_input import ANGLES, XML, assemble, read
 
+WRONG, SIZE = 1, 6.0
+"""How many measurements are wrong in a simulated job, and by how many standard
+deviations."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -31,8 +35,8 @@ class Options:
     force: bool = False
     json: bool = False
     promise: int | None = None
-    wrong: int = 1
-    size: float = 6.0
+    wrong: int | None = None
+    size: float | None = None
 
 
 def run(options: Options) -> bool:
@@ -75,10 +79,7 @@ def calculate(options: Options) -> Done:
     )
     names = list(dict.fromkeys(name for line in given.lines for name in line.points))
     network, lines = assemble(given, names)
-    simulated = None
-    if options.promise is not None:
-        _check_promise(options, lines)
-        simulated = Simulated(options.promise, options.wrong, options.size)
+    simulated = _simulated(options, lines)
     with say_what("Adjusting the network ..."):
         solution = adjust_network(network)
     return Done(
@@ -133,8 +134,19 @@ def _check(options: Options) -> None:
             )
 
 
-def _check_promise(options: Options, lines: list[Measurement]) -> None:
-    """Raises TableError for what cannot be simulated."""
+def _simulated(options: Options, lines: list[Measurement]) -> Simulated | None:
+    """What is to be simulated. Raises TableError for what cannot be."""
+    if options.promise is None:
+        for name, value in (("--wrong", options.wrong), ("--size", options.size)):
+            if value is not None:
+                raise TableError(
+                    name,
+                    found="it without --promise",
+                    expected="--promise TRIALS with it",
+                )
+        return None
+    wrong = WRONG if options.wrong is None else options.wrong
+    size = SIZE if options.size is None else options.size
     several = [line for line in lines if len(line.values) > 1]
     if several:
         raise TableError(
@@ -143,11 +155,12 @@ def _check_promise(options: Options, lines: list[Measurement]) -> None:
             f"{several[0].line}",
             expected="a network whose measurements are single numbers",
         )
-    if not 0 <= options.wrong < len(lines):
+    if not 0 <= wrong < len(lines):
         raise TableError(
             "--wrong",
-            found=str(options.wrong),
+            found=str(wrong),
             expected=f"0, or less than the {len(lines)} measurements",
         )
-    if not math.isfinite(options.size):
-        raise TableError("--size", found=repr(options.size), expected="a number")
+    if not math.isfinite(size):
+        raise TableError("--size", found=repr(size), expected="a number")
+    return Simulated(options.promise, wrong, size)

@@ -150,6 +150,13 @@ def test_points_that_nothing_joins_to_known_ones_are_named(tmp_path):
     )
 
 
+@pytest.mark.parametrize("option", ["--wrong", "--size"])
+def test_errors_of_no_simulation_are_refused(option):
+    told = run("adjust", option, "2")
+    assert told.exit_code == 2
+    assert f"{option}: found it without --promise" in words(told.stderr)
+
+
 def test_a_promise_of_vectors_is_refused(tmp_path):
     (tmp_path / "network.csv").write_text("from,to,dX,dY,dZ,sigma\na,b,1,2,3,1\n")
     told = run("adjust", tmp_path / "network.csv", "--promise", "100")

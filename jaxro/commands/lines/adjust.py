@@ -88,12 +88,14 @@ Promise = Annotated[
     ),
 ]
 Wrong = Annotated[
-    int,
-    typer.Option(help="Wrong measurements in each of them.", metavar="K"),
+    int | None,
+    typer.Option(help="Wrong measurements in each of them, 1 by default.", metavar="K"),
 ]
 Size = Annotated[
-    float,
-    typer.Option(help="Their errors, in standard deviations.", metavar="S"),
+    float | None,
+    typer.Option(
+        help="Their errors, in standard deviations, 6 by default.", metavar="S"
+    ),
 ]
 
 
@@ -107,8 +109,8 @@ def adjust(
     angles: Angles = "degrees",
     unit: Unit = "m",
     promise: Promise = None,
-    wrong: Wrong = 1,
-    size: Size = 6.0,
+    wrong: Wrong = None,
+    size: Size = None,
     out: Out = None,
     force: given.Force = False,
     json: given.Json = False,
