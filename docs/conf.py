@@ -98,11 +98,12 @@ def check_outputs(app, doctree) -> None:
     for cell, expected in zip(cells, SHOWN[app.env.docname], strict=True):
         blocks = cell.findall(nodes.literal_block)
         streams = [block for block in blocks if "stream" in block["classes"]]
-        printed = "\n".join(block.astext() for block in streams)
-        if to_lines(printed) != to_lines(expected):
+        # what is printed slowly comes in several blocks
+        lines = [line for block in streams for line in to_lines(block.astext())]
+        if lines != to_lines(expected):
             logger.warning(
                 "a cell prints:\n%s\nwhere its page shows:\n%s",
-                printed,
+                "\n".join(lines),
                 expected,
                 location=cell,
             )
