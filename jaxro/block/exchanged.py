@@ -43,11 +43,13 @@ def find_exchanged(adjusted: BlockAdjustment) -> dict[tuple[str, str], list[str]
     rays = np.bincount(block.point, minlength=len(block.points))
     left_out = np.flatnonzero(~adjusted.numbered.rays & (rays[block.point] >= 2))
     read = reader_of(adjusted)
+    by_point = np.argsort(block.point, kind="stable")
+    begins = np.cumsum([0, *rays])
 
     def fits(ray: int, instead: int) -> bool:
         """Whether the rays of a point meet with another one in place of one of them."""
         number = int(block.point[ray])
-        own = np.flatnonzero(block.point == number)
+        own = by_point[begins[number] : begins[number + 1]]
         point = read(number, np.where(own == ray, instead, own))
         every = np.ones(len(own), bool)
         return point.cost(every) <= point.limit(every)

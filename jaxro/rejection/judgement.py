@@ -194,8 +194,10 @@ OF_DECISION = ("decision", "kept", "out", "heavy")
 
 class AbstractStep(eqx.Module):
     """A step of a procedure, a program of its own: it judges the pairs that are open to
-    it. Most pairs are open to few steps. `reads` and `changes`: the
-    fields of a judgement that it looks at, and that it tells anew."""
+    it. Most pairs are open to few steps.
+
+    `reads` and `changes`: the fields of a judgement that it looks at, and that it tells
+    anew."""
 
     reads: eqx.AbstractClassVar[tuple[str, ...]]
     changes: eqx.AbstractClassVar[tuple[str, ...]]

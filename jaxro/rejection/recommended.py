@@ -142,7 +142,7 @@ class IsInDoubt(AbstractStep):
     few points out."""
 
     level: Level
-    reads: ClassVar[tuple[str, ...]] = ("decision",)
+    reads: ClassVar[tuple[str, ...]] = ("decision", "unchecked")
     changes: ClassVar[tuple[str, ...]] = ("doubtful",)
 
     def is_open(self, known: Judgement) -> Bool[Any, "*pairs"]:
@@ -153,5 +153,5 @@ class IsInDoubt(AbstractStep):
         """With the doubtful points."""
         pose, use, _, scale = known.decision
         pair = self.level.judged_by(pair, scale)
-        wrong = pair.mask & ~use & seen(pair, pose, 0.0, use)
+        wrong = pair.mask & ~use & ~known.unchecked & seen(pair, pose, 0.0, use)
         return known._replace(doubtful=undecided_points(pair, pose, use, wrong))

@@ -74,7 +74,9 @@ class IsChecked(AbstractStep):
         """With the decision that only such points are in use."""
         pose, use, _, scale = known.decision
         pair, limit = self.level.judged_by(pair, scale), self.level.limit(pair)
-        found = without_unchecked(pair, pose, use, limit, known.base.chance)
+        # what was left out before, though it fits, does not come back
+        others = pair.with_mask(pair.mask & ~known.unchecked)
+        found = without_unchecked(others, pose, use, limit, known.base.chance)
         decision = known.decision._replace(pose=found.pose, use=found.use)
         unchecked = known.unchecked | found.unchecked
         return known.decided(pair, decision)._replace(unchecked=unchecked)

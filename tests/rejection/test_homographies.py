@@ -60,12 +60,14 @@ def test_planes_of_few_points_are_right_where_they_are_successful():
         solved = rejection.orientation
         settled = rejection.outcome != OUTCOMES.no_consensus
         fine = settled & (solved.result == jaxro.RESULTS.successful)
-        return fine, solved.pose.relative()[0], rejection.unchecked
+        points = rejection.unchecked, rejection.in_use, rejection.undecided
+        return fine, solved.pose.relative()[0], points
 
-    fine, rotation, unchecked = jaxro.clean_batch(given, Recommended(), select=read)
-    fine = np.asarray(fine)
+    fine, rotation, points = jaxro.clean_batch(given, Recommended(), select=read)
+    fine, (unchecked, *others) = np.asarray(fine), map(np.asarray, points)
     turned = np.moveaxis(np.array(rotation), (0, 1), (-2, -1))
     off = np.linalg.norm(turned - pairs.rotation, axis=(1, 2)) / np.sqrt(2)
     assert np.sum(fine) > 50
     assert np.sum(fine & (off > np.deg2rad(2))) <= 0.03 * np.sum(fine)
-    assert np.mean(np.any(np.asarray(unchecked) & ~pairs.good, axis=1)) > 0.05
+    assert np.mean(np.any(unchecked & ~pairs.good, axis=1)) > 0.05
+    assert not any(np.any(unchecked & other) for other in others)
