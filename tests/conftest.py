@@ -4,6 +4,7 @@ measured data."""
 import gc
 import os
 import resource
+from functools import wraps
 from importlib.metadata import version
 from pathlib import Path
 
@@ -43,16 +44,34 @@ os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(1 << 32)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 import jax  # noqa: E402
+import numpy as np  # noqa: E402
 from examples import example  # noqa: E402, F401 (a fixture of all tests)
 from jax.experimental.compilation_cache import compilation_cache  # noqa: E402
 from program_budget import Budget  # noqa: E402
 
+from jaxro.batches import padding  # noqa: E402
+from jaxro.geometry import pairs  # noqa: E402
 from jaxro.xla import programs, settings, store  # noqa: E402
 
 # what JAX keeps of the programs would be looked through at every collection: a
 # sixteenth of the time
 gc.disable()
 settings.COMPILE_FAST.update(settings.COMPILE_FASTEST)
+# pairs are padded to fewer sizes, as each is another program: 16, 64, 256, ...
+pairs.ROOMS = pairs.ROOMS[::2]
+
+
+def few(steps):
+    """In place of all steps of a table, the sizes of single pairs."""
+
+    @wraps(steps)
+    def rooms(longest):
+        return np.array(pairs.ROOMS[: pairs.ROOMS.index(pairs.room_for(longest)) + 1])
+
+    return rooms
+
+
+padding.steps = few(padding.steps)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

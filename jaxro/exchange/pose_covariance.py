@@ -39,6 +39,10 @@ from ..xla.programs import compiled
 from .poses import camera_pose, of_each, station_pose
 from .tangents import CameraPose, Tangent, gtsam
 
+SINGULAR = 1e15
+"""Condition of a scaled matrix above which it has no inverse: that of pairs whose points
+determine no orientation."""
+
 Matrices = Float[np.ndarray, "*pairs 6 6"]
 
 
@@ -241,8 +245,9 @@ def _inverse(matrices: Float[np.ndarray, "*pairs n n"]) -> np.ndarray:
     columns = np.linalg.norm(scaled, axis=-2, keepdims=True)
     scaled = scaled / np.where(columns > 0, columns, 1.0)
     there = np.all(np.isfinite(scaled), axis=(-2, -1)) & np.all(rows > 0, axis=(-2, -1))
-    safe = np.where(there[..., None, None], scaled, np.eye(matrices.shape[-1]))
-    found = np.linalg.inv(safe)
+    unit = np.eye(matrices.shape[-1])
+    there &= np.linalg.cond(np.where(there[..., None, None], scaled, unit)) < SINGULAR
+    found = np.linalg.inv(np.where(there[..., None, None], scaled, unit))
     found = found / columns.swapaxes(-1, -2) / rows.swapaxes(-1, -2)
     return np.where(there[..., None, None], found, np.nan)
 

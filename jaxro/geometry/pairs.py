@@ -320,20 +320,21 @@ def pad(one: Pair, points: int) -> Pair:
 
 
 def quickly(pair: Pair, *_: Any, **__: Any) -> dict[str, Any]:
-    """How to compile what works on one pair: it is ready the sooner, the fewer points
-    there are."""
+    """How to compile what works on one pair: the fewer points, the sooner it is ready."""
     return settings_for(pair.x_left.size)
 
 
+ROOMS = tuple(16 << doublings for doublings in range(28))
+"""Places that single pairs are padded to: each size has a program, not each number."""
+
+
 def room_for(points: int) -> int:
-    """The places that a single pair of so many points is padded to: 16, 32, 64, ... A
-    program is compiled for a number of places, not for each of points."""
-    return max(16, 1 << (points - 1).bit_length())
+    """The places that a single pair of so many points is padded to."""
+    return next(room for room in ROOMS if room >= points)
 
 
 def first_points(tree: PyTree, points: int) -> PyTree:
-    """The arrays of a tree without the places behind these points, by NumPy, which
-    compiles nothing for another number of points."""
+    """The arrays of a tree with so many places, by NumPy, which compiles nothing."""
     return jax.device_put(jax.tree.map(lambda a: np.asarray(a)[..., :points], tree))
 
 

@@ -130,6 +130,7 @@ def test_it_is_the_dense_adjustment(strip):
     np.testing.assert_allclose(found.common_cofactor, own, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_free_network(strip):
     """The datum is the mean of the photos' positions, where distances alone hold the
     scale and angles the directions."""

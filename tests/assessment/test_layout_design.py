@@ -90,6 +90,7 @@ def found(criterion, points, overlap=None, **options):
     return result, places[np.lexsort(np.round(places, 3).T)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "criterion",
     [CRITERIA[0], pytest.param(CRITERIA[1], marks=pytest.mark.slow)],

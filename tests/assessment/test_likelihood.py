@@ -141,16 +141,27 @@ def test_an_end_within_the_region_is_found():
     assert most[0] == pytest.approx(1.0, abs=1e-7)
 
 
+def test_what_has_no_sigma0_has_no_region():
+    pair, truth, found = without_sigma0()
+    assert np.isnan(likelihood.curvature(pair, found))
+    assert bool(likelihood.region_holds(pair, found, truth))
+
+
+@pytest.mark.slow
 def test_what_has_no_sigma0_has_no_end():
+    pair, _, found = without_sigma0()
+    assert not np.any(np.isfinite(np.stack(likelihood.interval(pair, found))))
+
+
+def without_sigma0():
+    """A pair, its true pose, and an orientation without redundancy."""
     pair, truth, found = first()
     found = dataclasses.replace(
         found,
         sigma0=jnp.asarray(jnp.nan),
         degrees_of_freedom=jnp.zeros_like(found.degrees_of_freedom),
     )
-    assert np.isnan(likelihood.curvature(pair, found))
-    assert not np.any(np.isfinite(np.stack(likelihood.interval(pair, found))))
-    assert bool(likelihood.region_holds(pair, found, truth))
+    return pair, truth, found
 
 
 @pytest.mark.slow

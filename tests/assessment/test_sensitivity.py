@@ -211,6 +211,7 @@ def test_steps_that_do_not_suffice_are_told():
     np.testing.assert_allclose(found.value, stopped.sigma0, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_second_order_term():
     """What the normal equations alone say, -Q Aᵀ P B, is off by far more than the
     tolerance above."""

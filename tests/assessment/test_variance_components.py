@@ -151,6 +151,7 @@ def test_what_is_not_estimable_is_told():
     np.testing.assert_allclose(result.pooled**2, (SMALL**2 + LARGE**2) / 2, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_an_estimable_group_beside_others_that_are_not():
     """Few good points in vertical pairs, y of their photos not to be told apart: the
     others are estimated as well."""

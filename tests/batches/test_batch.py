@@ -89,6 +89,7 @@ def test_batch_equals_one_by_one(pairs, whole):
             np.testing.assert_allclose(one[i], other, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_more_points_than_a_chunk_holds():
     rng = np.random.default_rng(7)
     x, y, z = rng.uniform((0, -90, -165), (90, 90, -135), (20_000, 3)).T

@@ -8,6 +8,7 @@ import oracles
 import pytest
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
+from tiers import seldom
 
 import jaxro
 from jaxro.block import absolute
@@ -180,7 +181,7 @@ MIXED = np.array(
 SMALL = 0.01
 
 
-@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("joint", seldom([False, True], [False]))
 def test_is_the_dense_adjustment(joint):
     """With control of all kinds and accuracies, and errors of the model of each point
     or of all together. The errors drawn are small for their deviations: what is of

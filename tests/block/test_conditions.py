@@ -57,7 +57,7 @@ def adjusted(made):
     ("made", "freedom"),
     seldom(
         [(strip_of_three, 40), (block_with_partial_control, 194), (free_network, 21)],
-        [strip_of_three, free_network],
+        [strip_of_three],
     ),
 )
 def test_the_conditions_have_the_minimum_of_the_block(made, freedom):

@@ -120,6 +120,7 @@ def test_legs_of_one_line_are_named_together(tmp_path):
     assert told["wrong"] == ["a-m", "m-b"] and not told["usable"]
 
 
+@pytest.mark.slow
 def test_the_promise_of_a_net(tmp_path):
     """A free net has the intervals and verdicts of the same net with a known point."""
     ask = ("--sigma", "0.3", "--promise", "300", "--size", "8")

@@ -390,6 +390,7 @@ def two_scenes(tmp_path_factory):
     return path, ["--focal", repr(focal), "--sigma", "1"]
 
 
+@pytest.mark.slow
 def test_several_solutions_are_told_with_their_points(two_scenes, tmp_path):
     """In words, in the JSON and on the page of the report: the pair is not usable."""
     table, how = two_scenes

@@ -316,6 +316,7 @@ def test_the_ten_points_of_the_introduction(paper):
     assert paper.ten_rejected == [3, 7]
 
 
+@pytest.mark.slow
 def test_reproduce_prints_the_paper_beside_what_is_calculated(paper):
     result = run("reproduce", "dorozhinsky1971")
     assert result.exit_code == 0

@@ -399,7 +399,7 @@ SOLVERS = {
         pytest.param(
             solver,
             system,
-            marks=[] if i == j else pytest.mark.slow,
+            marks=[] if i == j == 0 else pytest.mark.slow,
             id=f"{name}-{system.__name__}",
         )
         for i, (name, solver) in enumerate(SOLVERS.items())

@@ -110,6 +110,7 @@ def found():
     }
 
 
+@pytest.mark.slow
 def test_random_pairs_in_any_position(found):
     check_poses(found["thousand"], THOUSAND()[1])
 
@@ -142,6 +143,7 @@ def sure(*found):
     return np.all([np.asarray(f.result == RESULTS.successful) for f in found], axis=0)
 
 
+@pytest.mark.slow
 def test_most_pairs_with_errors_are_oriented(found):
     assert np.mean(sure(found["hundred"])) > 0.95
 

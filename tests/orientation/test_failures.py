@@ -87,7 +87,7 @@ LINE = np.column_stack(
     [np.linspace(0, 1, 9), np.linspace(-0.5, 0.5, 9), -np.full(9, 2.0)]
 )
 FOUR_ZONES = np.repeat([[0, 0, -1.0], [1, 0, -1], [0, 1, -1], [0, -1, -1]], 2, axis=0)
-TRIED = 400
+TRIED = 200
 UNDETERMINED = {
     "on a line": lambda seed: measured(LINE, sigma=0.005, seed=seed),
     "two zones empty": lambda seed: measured(FOUR_ZONES, sigma=0.005, seed=seed),

@@ -57,7 +57,7 @@ VERTICAL = jaxro.starts.Vertical()
 @pytest.mark.parametrize(
     ("points", "start"),
     [
-        (5, VERTICAL),
+        pytest.param(5, VERTICAL, marks=pytest.mark.slow),
         pytest.param(37, VERTICAL, marks=pytest.mark.slow),
         *(
             pytest.param(n, jaxro.starts.Auto(), marks=pytest.mark.slow)

@@ -170,6 +170,7 @@ def test_five_points_survive_degenerate_input():
         assert np.array_equal(np.asarray(a)[4:], np.asarray(b)[4:])
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop():
     """Nested vmap, one vmap and single calls give the same numbers; so does a vmap over
     one argument."""

@@ -210,6 +210,7 @@ TABLE_2 = (
 (minutes) after it."""
 
 
+@pytest.mark.slow
 def test_log_is_table_2_and_the_operator_is_asked_for():
     select = lambda found: (found.log, found.outcome, found.mask)
     run = problems.jit(lambda pair: select(Dorozhinsky(corrections=3)(pair)))

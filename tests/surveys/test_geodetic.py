@@ -197,6 +197,7 @@ def test_a_vector_is_tested_as_a_whole(measured):
     )
 
 
+@pytest.mark.slow
 def test_vectors_with_one_covariance_matrix():
     """Two vectors that were measured together, and a third: least squares with all
     weights."""
