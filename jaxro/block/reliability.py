@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 
 from ..adjustment import critical_values as critical
 from .adjust import BlockAdjustment
-from .wrong import UNCHECKED
+from .wrong import UNCHECKED, independent_tests
 
 
 class Checked(NamedTuple):
@@ -84,10 +84,8 @@ def assess_block(
             )
     adjusted.check()
     rays, control = adjusted.redundancy, adjusted.control_redundancy
-    tested = np.sum(rays > UNCHECKED) + np.sum(control > UNCHECKED)
     if familywise:
-        number = max(min(int(tested), adjusted.degrees_of_freedom), 1)
-        level = float(critical.sidak(level, number))
+        level = float(critical.sidak(level, independent_tests(adjusted)))
     delta0 = float(critical.delta_normal(level, power))
     sigma = np.repeat(adjusted.block.sigma[:, None], 2, axis=1)
     of_control = np.zeros((0, 3)) if adjusted.ground is None else adjusted.ground.sigma
