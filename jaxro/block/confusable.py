@@ -17,9 +17,9 @@ from .place import TooLittleControl
 from .wrong import adjust_rest, normalise_residuals
 from .wrong_points import GAP
 
-CLEARLY = 4 * GAP
-"""By how much the sum of squares falls at least without a known point: below it the
-error is so small that it hardly matters which one is left out."""
+PART = 0.5
+"""Part of what the best omission takes off the sum of squares that another one may leave
+in it, up to `GAP`."""
 
 RELEVANT = 0.5
 """Part of the largest w of all known points, while the one that was left out takes part,
@@ -84,8 +84,9 @@ def _alone(given: Given, outcome: Outcome, back: list[int], level: float) -> lis
     # the rays that come back have residuals, too
     most = _misfit(outcome.adjusted) + 2 * int(np.sum(wrong.rays & ~rays))
     whole = _adjust(given, outcome, together)
-    if whole is None or _misfit(whole) < most + CLEARLY:
+    if whole is None or _misfit(whole) < most + GAP:
         return []
+    gap = min(GAP, PART * (_misfit(whole) - most))
     w = np.max(np.nan_to_num(np.abs(normalise_residuals(whole).control)), axis=1)
     w[ground.check | ground.station] = 0.0
     others = np.flatnonzero(w >= RELEVANT * np.max(w)).tolist()
@@ -97,7 +98,7 @@ def _alone(given: Given, outcome: Outcome, back: list[int], level: float) -> lis
         control = together.control.copy()
         control[j] = True
         other = _adjust(given, outcome, together._replace(control=control))
-        if other is not None and _misfit(other) <= most + GAP and _fits(other, level):
+        if other is not None and _misfit(other) <= most + gap and _fits(other, level):
             found.append(j)
     return found
 
