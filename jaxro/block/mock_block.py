@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 from ..batches.ragged import Ragged
 from .chain import Chained
-from .measured_block import Ground, MeasuredBlock, ground, pairs_of_rays
+from .measured_block import Ground, MeasuredBlock, ground
+from .photo_pairs import FEWEST, common_points
 
 
 class Flight(NamedTuple):
@@ -109,37 +110,25 @@ def mock_block(
 
 
 def pairs_of(
-    block: MeasuredBlock, seed: int = 0, fewest: int = 6
+    block: MeasuredBlock, seed: int = 0, fewest: int = FEWEST
 ) -> tuple[list[str], list[str], Ragged, list[str]]:
     """All pairs of photos with so many points in common, in random order and direction:
     what `measured_block.from_pairs` takes."""
     rng = np.random.default_rng(seed)
-    by_point = np.lexsort((block.photo, block.point))
-    rows, point = [], block.point[by_point]
-    for lag in range(1, len(point)):
-        same = np.flatnonzero(point[lag:] == point[:-lag])
-        if len(same) == 0:
-            break
-        rows.append(np.stack([by_point[same], by_point[same + lag]]))
-    one, other = np.concatenate(rows, axis=1)
-    key = block.photo[one] * len(block.photos) + block.photo[other]
-    keys, inverse, number = np.unique(key, return_inverse=True, return_counts=True)
-    use = np.flatnonzero(number >= fewest)
-    order = rng.permutation(use)
+    common = common_points(block)
+    order = rng.permutation(np.flatnonzero(common.counts >= fewest))
+    chosen = common.take(order)
     turned = rng.random(len(order)) < 0.5
-    rank = np.full(len(keys), -1)
-    rank[order] = np.arange(len(order))
-    kept = rank[inverse] >= 0
-    one, other, pair = one[kept], other[kept], rank[inverse][kept]
-    swap = turned[pair]
-    one, other = np.where(swap, other, one), np.where(swap, one, other)
-    by_pair = np.argsort(pair, kind="stable")
-    one, other, pair = one[by_pair], other[by_pair], pair[by_pair]
-    begins = np.searchsorted(pair, np.arange(len(order) + 1))
-    left, right = block.photo[one[begins[:-1]]], block.photo[other[begins[:-1]]]
-    pairs = pairs_of_rays(block, begins, one, other, left, right)
+    swap = np.repeat(turned, chosen.counts)
+    chosen = chosen._replace(
+        left=np.where(turned, chosen.right, chosen.left),
+        right=np.where(turned, chosen.left, chosen.right),
+        one=np.where(swap, chosen.other, chosen.one),
+        other=np.where(swap, chosen.one, chosen.other),
+    )
     name = lambda numbers: [block.photos[k] for k in numbers]
-    return name(left), name(right), pairs, [block.points[k] for k in block.point[one]]
+    points = [block.points[k] for k in block.point[chosen.one]]
+    return name(chosen.left), name(chosen.right), chosen.as_pairs(block), points
 
 
 def _places(flight: Flight, centres, rotations, points, base, across):

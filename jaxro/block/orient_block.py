@@ -32,6 +32,10 @@ MOVED = 3.0
 """Deviations of a point by which a cause moves it at most, if the numbers without the
 cause may be used."""
 
+LENS = 1e-3
+"""Part of the focal length that the errors of a place by unknown inner parameters are
+taken for where pairs are oriented for a start."""
+
 TOO_SMALL = 3.0
 """Ratio of the residuals to the given standard deviations from which these are the
 reason why pairs are refused."""
@@ -86,11 +90,19 @@ def orient_block(
     block = from_pairs(left, right, pairs, points) if more is None else more
     if bars is not None and not np.any(bars.are_in(block)):
         raise NoBar("orient_block: no bar has both of its points in the block")
-    joined = join_pairs(block, left, right, pairs)
+    rough = pairs if inner is None else _without_lens(pairs)
+    joined = join_pairs(block, left, right, rough)
     given = Given(joined.block, ground, inner, bars)
     judged = adjust_and_judge(given, joined.chained, level, components, sigma_known)
     cause = joined.cause or judged.cause
     return OrientedBlock(*judged.outcome, joined.usable, judged.contradictions, cause)
+
+
+def _without_lens(pairs: Ragged) -> Ragged:
+    """The pairs with standard deviations that cover what unknown inner parameters do to
+    their places."""
+    focal = np.repeat(np.minimum(pairs.focal_left, pairs.focal_right), pairs.lengths)
+    return pairs._replace(sigma=np.maximum(pairs.sigma, LENS * focal))
 
 
 class Judged(NamedTuple):

@@ -27,9 +27,9 @@ from ..tables.examples import block as example
 from ..tables.fields import TableError
 from ..tables.ground import GroundPoints
 from ..tables.measured import Table, to_list
-from ..tables.survey_checks import Row
-from . import request
+from . import block_places, request
 from .block_pairs import is_sigma_given, measure, read_pairs
+from .block_places import in_photos
 
 RADIAL = ("k1", "k2", "k3")
 INNER = ("focal", "principal", *RADIAL, "tangential", "affinity")
@@ -102,18 +102,14 @@ def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
     _check(options)
     if options.measured.file is None:
         return _simulate(options)
+    if block_places.are_given(options.measured):
+        return _of_places(options), {}
     own, table, cameras = read_pairs(options.measured)
     left, right = cameras.photos_of(
         table.names, table.file, given=table.photos, place=table.first_line
     )
     pairs, told = measure(own, table, cameras)
-    ground, approximate = None, 0
-    if options.control is not None:
-        points = ground_tables.read(
-            options.control,
-            (*ground_tables.ROLES, ground_tables.STATION),
-        )
-        ground, approximate = _ground(points, options.control_sigma)
+    ground, approximate = _control(options)
     task = Task(
         title=table.file,
         names=list(map(str, to_list(table.names))),
@@ -130,6 +126,47 @@ def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
         warnings=table.warnings,
     )
     return _with_rays(task, options, table, cameras), {}
+
+
+def _of_places(options: Options) -> Task:
+    """The task of a table with a row for each place. Raises TableError."""
+    if options.rays is not None:
+        raise TableError(
+            "--rays",
+            found=f"it beside {options.measured.file}, a table of places itself",
+            expected="all places in one table",
+        )
+    measured = block_places.read(options.measured)
+    block, common = measured.block, measured.common
+    ground, approximate = _control(options)
+    name = lambda photos: [block.photos[k] for k in photos]
+    left, right = name(common.left), name(common.right)
+    return Task(
+        title=str(options.measured.file),
+        names=[f"{one}-{other}" for one, other in zip(left, right, strict=True)],
+        left=left,
+        right=right,
+        pairs=common.as_pairs(block),
+        points=[block.points[k] for k in block.point[common.one]],
+        sigma=measured.sigma,
+        sigma_known=measured.sigma_known,
+        ground=ground,
+        more=block,
+        bars=_bars(options),
+        approximate=approximate,
+        photo_unit=options.measured.unit,
+        warnings=measured.warnings,
+    )
+
+
+def _control(options: Options) -> tuple[Ground | None, int]:
+    """What is known of the ground, and how many points are approximate only. Raises
+    TableError."""
+    if options.control is None:
+        return None, 0
+    roles = *ground_tables.ROLES, ground_tables.STATION
+    points = ground_tables.read(options.control, roles)
+    return _ground(points, options.control_sigma)
 
 
 def _check(options: Options) -> None:
@@ -263,7 +300,8 @@ def _with_rays(task: Task, options: Options, table: Table, cameras: Cameras) -> 
     if options.rays is None:
         return replace(task, more=block)
     rows = images.read_places(options.rays)
-    places, sigma = _places(rows, cameras, options, task)
+    places, sigma = in_photos(rows, cameras)
+    sigma = np.where(np.isnan(sigma), np.median(task.pairs.sigma), sigma)
     photos = [row.cells["image"] for row in rows]
     for row in rows:
         if row.cells["image"] not in block.photos:
@@ -309,30 +347,6 @@ def _twice(error: TwoPoints, task: Task, table: Table, cameras: Cameras) -> Tabl
         expected="one name for one point in all pairs; rename one of the two, or delete "
         "the wrong line",
     )
-
-
-def _places(
-    rows: list[Row], cameras: Cameras, options: Options, task: Task
-) -> tuple[np.ndarray, np.ndarray]:
-    """The places of --rays as photo coordinates, and their standard deviations: as
-    given there, else as the median of the pairs."""
-    places, sigma = [], []
-    usual = float(np.median(task.pairs.sigma))
-    for row in rows:
-        name = row.cells["image"]
-        camera = cameras.of_photo(name)
-        if camera is None:
-            raise row.error(
-                "photo",
-                found=repr(name),
-                expected=f"a photo of {cameras.file}: {', '.join(cameras.photos)}",
-            )
-        at = np.array([row.cells["x"], row.cells["y"]]) - camera.principal_point
-        sign = np.array([1.0, -1.0 if camera.y_down else 1.0])
-        places.append(at * sign * camera.pixel_size)
-        own = row.cells.get("sigma")
-        sigma.append(usual if own is None else own * camera.pixel_size)
-    return np.array(places), np.array(sigma)
 
 
 # -------------------------------------------------------------------------------------

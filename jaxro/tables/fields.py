@@ -201,6 +201,12 @@ def find_separator(text: Iterable[str]) -> tuple[str, Iterator[str]]:
     return next((mark for mark in ";\t" if mark in header), ","), chain(first, lines)
 
 
+def header_of(path: Path) -> list[str]:
+    """The entries of the header of a table, none of an empty file. Raises TableError."""
+    separator, lines = find_separator(text_lines(path))
+    return next((row for _, row in _rows(lines, str(path), separator)), [])
+
+
 def lines_of(
     text: Iterable[str], file: str, columns: Columns
 ) -> Iterator[tuple[int, dict[str, str]]]:

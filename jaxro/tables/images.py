@@ -87,6 +87,12 @@ def read_places(path: Path) -> list[Row]:
     return places(fields.read_text(path), str(path), path.stem)
 
 
+def are_places(path: Path) -> bool:
+    """Whether the header of a table is that of places measured photo by photo."""
+    header = {PLACES.full(entry) for entry in fields.header_of(path)}
+    return {"image", *PLACES.required} <= header
+
+
 def read_points(path: Path) -> list[Row]:
     """The object points of a file. Raises TableError."""
     return points(fields.read_text(path), str(path))

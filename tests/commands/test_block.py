@@ -181,6 +181,62 @@ def test_rays_that_stand_in_the_pairs_count_once(tables, written, tmp_path):
 
 
 @pytest.mark.slow
+def places_of(pairs):
+    """The places of a table of pairs, each once."""
+    places = {}
+    for row in rows(pairs):
+        for side in ("left", "right"):
+            place = row[f"x_{side}"], row[f"y_{side}"]
+            places[row[side], row["point"]] = place
+    return places
+
+
+def test_a_row_for_each_place_is_the_same_block(tables, written, tmp_path):
+    """In any order of the rows, and with a point that one photo shows alone."""
+    places = places_of(tables[0])
+    lines = [",".join([*names, *place]) for names, place in reversed(places.items())]
+    text = "\n".join(["Photo;Point;x;y", *lines, "1-1,lonely,1.5,-2.5"])
+    table = write(tmp_path, text.replace(",", ";"), "places.csv")
+    out = tmp_path / "out"
+    told = block((table, tables[1]), "--out", out)
+    assert told.exit_code == 0, told.stderr
+    assert f"on {len(places) + 1} places" in words(told.stdout)
+    for name in ("photos", "points"):
+        expected = rows(written / f"{name}.csv")
+        found = [
+            row for row in rows(out / f"{name}.csv") if "lonely" not in row.values()
+        ]
+        own = [column for column in expected[0] if column.startswith(AXES)]
+        np.testing.assert_allclose(
+            numbers(found, *own), numbers(expected, *own), rtol=1e-6, atol=1e-6
+        )
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "said"),
+    [
+        ("1,a,0,0\n2,a,5,0\n", (), "found no two of 2 photos with 6 points in common"),
+        ("1,a,0,0\n1,a,5,0\n", (), "line 3, column point: found 'a' a second time"),
+        ("1,a,0,0\n", ("--rays", "RAYS"), "--rays: found it beside"),
+        (
+            "1,a,0,0\n",
+            ("--camera", "OTHER"),
+            "column photo: found '1'; expected a photo",
+        ),
+    ],
+)
+def test_places_that_make_no_block(text, more, said, tmp_path):
+    table = write(tmp_path, "photo,point,x,y\n" + text, "places.csv")
+    files = {
+        "RAYS": write(tmp_path, "photo,point,x,y\n1,b,1,1\n", "rays.csv"),
+        "OTHER": write(tmp_path, "[photo.7]\nfocal = 153\n", "camera.toml"),
+    }
+    more = [files.get(value, value) for value in more]
+    focal = () if "--camera" in more else ("--focal", "153")
+    told = run("block", table, *focal, *more)
+    assert told.exit_code == 2 and said in words(told.stderr), told.stderr
+
+
 def test_stations_inner_parameters_and_components(tables, written, tmp_path):
     """Stations are rows of the ground with this role; a wrong focal length is found."""
     plain = json.loads((written / "summary.json").read_text())

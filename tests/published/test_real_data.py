@@ -12,6 +12,8 @@ import numpy as np
 import oracles
 import problems
 import pytest
+from bad_tables import write
+from command_line import rows, run
 
 from jaxro import RESULTS, pad
 
@@ -168,3 +170,46 @@ def test_agrees_with_opencv(data, folder, name):
         )
     )
     assert turn < 0.1 and shift < 0.4
+
+
+STATIONS = ("X", "Y", "Z")
+LENS = "focal,principal,k1,k2,k3,tangential,affinity"
+
+
+@pytest.mark.slow
+def test_a_network_of_places_is_that_of_its_report(data, tmp_path):
+    """Twenty-one photos of a target field, four known points, a row for each place, the
+    camera unknown: focal length, stations and deviations of DBAT's report, whose known
+    points have no errors, within these."""
+    folder = data / "olympus_camcal"
+    lines = lambda name: [
+        [cell.strip() for cell in line.split(",")]
+        for line in (folder / name).read_text().splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
+    photos = {number: path.split("/")[-1][:-4] for number, path in lines("images.txt")}
+    places = [[photos[k], *rest] for k, *rest in lines("markpts.txt")]
+    known = [[name, *rest[1:]] for name, *rest in lines("camcal-fixed.txt")]
+    table = lambda name, head, rows: write(
+        tmp_path, "\n".join([head, *map(",".join, rows)]), name
+    )
+    camera = "[camera]\nfocal = 7.6\nprincipal_point = [1136, 852]\ny_down = true\n"
+    found = run(
+        "block",
+        table("places.csv", "photo,point,x,y,sigma", places),
+        *("--control", table("known.csv", "point,X,Y,Z", known)),
+        *("--control-sigma", "0.001", "--inner", LENS, "--out", tmp_path / "out"),
+        *(
+            "--camera",
+            write(tmp_path, f"{camera}pixel_size = {5.43764 / 1704}\n", "c.toml"),
+        ),
+    )
+    assert found.exit_code == 0, found.stderr
+    camera = {row["parameter"]: row for row in rows(tmp_path / "out" / "cameras.csv")}
+    assert float(camera["focal"]["value"]) == pytest.approx(7.457, abs=0.005)
+    assert float(camera["k1"]["value"]) == pytest.approx(0.00459, abs=2e-5)
+    expected = {row["image"]: row for row in rows(folder / "published_eo.csv")}
+    for row in rows(tmp_path / "out" / "photos.csv"):
+        for axis in STATIONS:
+            off = float(row[axis]) - float(expected[row["photo"]][axis])
+            assert abs(off) < 3 * float(row[f"s{axis}"])

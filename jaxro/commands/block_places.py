@@ -1,0 +1,120 @@
+"""A block that is measured photo by photo: a table with one row for each place, and the
+pairs that its photos are chained from."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ..block.measured_block import MeasuredBlock
+from ..block.photo_pairs import FEWEST, CommonPoints, choose_pairs, common_points
+from ..exchange import files
+from ..geometry.pairs import Camera
+from ..reports.terminal import say_what
+from ..tables import images, whole
+from ..tables.cameras import Cameras
+from ..tables.fields import TableError
+from ..tables.survey_checks import Row
+from . import request, sigma as deviation
+
+
+@dataclass(frozen=True)
+class Places:
+    """A measured block, the points in common of the pairs that join its photos, its
+    sigma in words, and whether it was given."""
+
+    block: MeasuredBlock
+    common: CommonPoints
+    sigma: str
+    sigma_known: bool
+    warnings: tuple[str, ...] = ()
+
+
+def are_given(options: request.Options) -> bool:
+    """Whether the file of the user has a row for each place. Raises TableError where it
+    cannot be read."""
+    file = options.file
+    if file is None or whole.is_parquet(file) or files.is_of_other_program(file):
+        return False
+    return images.are_places(file)
+
+
+def read(options: request.Options) -> Places:
+    """The block of a table of places. Raises TableError."""
+    assert options.file is not None
+    with say_what(f"Reading {options.file} ..."):
+        rows = images.read_places(options.file)
+    has_sigma = "sigma" in rows[0].cells
+    request.check_numbers(
+        options, has_sigma, str(options.file), request.SYSTEMS["relative"]
+    )
+    cameras = request.read_cameras(options, request.MEASURED)
+    block = _block(rows, cameras)
+    common = choose_pairs(common_points(block), len(block.photos))
+    if not len(common.left):
+        raise TableError(
+            options.file,
+            found=f"no two of {len(block.photos)} photos with {FEWEST} points in common",
+            expected="the same name for the same point on all photos",
+        )
+    unit, stated = deviation.parse(options.sigma), "to the given standard deviations"
+    if not has_sigma and unit is None:
+        with say_what("Finding the standard deviation of the photo coordinates ..."):
+            noise = deviation.from_residuals(common.as_pairs(block))
+        unit, stated = noise.sigma, deviation.sentence(noise, options.unit)
+    block = block._replace(sigma=block.sigma * (1.0 if has_sigma else unit))
+    known = has_sigma or options.sigma not in (None, deviation.AUTO)
+    return Places(block, common, stated, known)
+
+
+def in_photos(
+    rows: list[Row], cameras: Cameras
+) -> tuple[Float[np.ndarray, "row 2"], Float[np.ndarray, " row"]]:
+    """Photo coordinates of rows of places, and their standard deviations, NaN where the
+    table has none. Raises TableError for a photo without a camera."""
+    each = [_camera(row, cameras) for row in rows]
+    size = np.array([camera.pixel_size for camera in each])
+    down = np.array([camera.y_down for camera in each])
+    signs = np.stack([np.ones(len(rows)), np.where(down, -1.0, 1.0)], axis=1)
+    at = np.array([[row.cells["x"], row.cells["y"]] for row in rows])
+    at = at - np.array([camera.principal_point for camera in each])
+    sigma = np.array([row.cells.get("sigma", np.nan) for row in rows])
+    return at * signs * size[:, None], sigma * size
+
+
+def _camera(row: Row, cameras: Cameras) -> Camera:
+    """The camera of a photo. Raises TableError where it has none."""
+    name = row.cells["image"]
+    camera = cameras.of_photo(name)
+    if camera is None:
+        photos = ", ".join(cameras.photos)
+        expected = (
+            f"a photo of {cameras.file}: {photos}"
+            if photos
+            else f"[camera], or [photo.NAME] for each photo, in {cameras.file}"
+        )
+        raise row.error("photo", found=repr(name), expected=expected)
+    return camera
+
+
+def _block(rows: list[Row], cameras: Cameras) -> MeasuredBlock:
+    """The block of the rows; sigma is one pixel where the table has none. Raises
+    TableError."""
+    places, sigma = in_photos(rows, cameras)
+    names = lambda column: np.unique(
+        [row.cells[column] for row in rows], return_inverse=True
+    )
+    (photos, photo), (points, point) = names("image"), names("point")
+    of_photo = dict(zip(photo.tolist(), rows, strict=True))
+    own = [_camera(of_photo[k], cameras) for k in range(len(photos))]
+    size = np.array([camera.pixel_size for camera in own])
+    return MeasuredBlock(
+        photos=tuple(map(str, photos)),
+        points=tuple(map(str, points)),
+        photo=photo,
+        point=point,
+        x=places[:, 0],
+        y=places[:, 1],
+        sigma=np.where(np.isnan(sigma), size[photo], sigma),
+        focal=np.array([camera.focal for camera in own]),
+    )
