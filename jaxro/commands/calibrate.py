@@ -35,6 +35,7 @@ from ..xla.programs import compiled
 from .calibration_columns import MISFIT, find_cause
 from .calibration_request import Options, Task, prepare
 from .calibration_tests import Alone, compare_distortions, tested_zones
+from .cameras_out import opencv_text
 from .corrected import Wanted, corrected_texts, read_wanted
 from .documents import settings, show_json
 from .plots import pictures_of_calibration
@@ -115,7 +116,7 @@ def write_texts(
 ) -> tuple[dict[str, str | bytes], list[str]]:
     """The files by name, and what to warn of."""
     done = with_maps(done)
-    texts: dict[str, str | bytes] = dict(contents(done))
+    texts: dict[str, str | bytes] = {**contents(done), **opencv_text(done)}
     warnings = []
     if asked is not None:
         of_places, told = corrected_texts(done, asked)

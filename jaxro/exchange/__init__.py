@@ -8,6 +8,10 @@ from .files import read as read
 from .h5 import read_h5 as read_h5
 from .matches import Matches as Matches
 from .opencv import pair_from_opencv as pair_from_opencv
+from .opencv_camera import (
+    OpencvCamera as OpencvCamera,
+    opencv_camera as opencv_camera,
+)
 from .pixels import PhotoPoints as PhotoPoints, pair_from_pixels as pair_from_pixels
 from .pose_covariance import (
     joint_pose_covariance as joint_pose_covariance,

@@ -1,10 +1,12 @@
 """Rays free of distortion, of lenses with Brown's distortion as OpenCV and Bundler
 write it.
 
-With the ray (u, v, 1), r² = u² + v², and the coefficients (k1, k2, p1, p2, k3, ...)
+With the ray (u, v, 1), r² = u² + v², and the coefficients (k1, k2, p1, p2, k3, k4, k5,
+k6), of which the last four or three may be missing,
 
-    u' = u (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 u v + p2 (r² + 2 u²)
-    v' = v (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2 v²) + 2 p2 u v
+    R  = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)
+    u' = u R + 2 p1 u v + p2 (r² + 2 u²)
+    v' = v R + p1 (r² + 2 v²) + 2 p2 u v
 
 is the distorted one, which the photo shows. The inverse has no formula. It is unique as
 far as the image does not fold: on the way from the centre to (u, v) the determinant of
@@ -42,25 +44,26 @@ class Inverse(NamedTuple):
     found: Bool[np.ndarray, " point"]
 
 
-def check_coefficients(coefficients: Coefficients) -> Float[np.ndarray, "5"]:
-    """(k1, k2, p1, p2, k3), zeros for those that are not given. Raises ValueError for
-    what are none."""
+def check_coefficients(coefficients: Coefficients) -> Float[np.ndarray, "8"]:
+    """All coefficients, zeros for those that are not given. Raises ValueError for what
+    are none."""
     given = np.ravel(np.asarray(coefficients, float))
-    if len(given) not in (2, 4, 5) or not np.all(np.isfinite(given)):
+    if len(given) not in (2, 4, 5, 8) or not np.all(np.isfinite(given)):
         raise ValueError(
-            "distortion: OpenCV's coefficients (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) "
-            f"are wanted, got {given.tolist()}; of other models undistort the points "
-            "first, or give a COLMAP camera"
+            "distortion: OpenCV's coefficients (k1, k2, p1, p2), and k3, or k3, k4, k5, "
+            f"k6 behind them are wanted, got {given.tolist()}; of other models undistort "
+            "the points first, or give a COLMAP camera"
         )
-    return np.append(given, np.zeros(5 - len(given)))
+    return np.append(given, np.zeros(8 - len(given)))
 
 
 def distort(rays: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """(u', v') of rays (u, v), real or complex."""
-    k1, k2, p1, p2, k3 = coefficients
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     u, v = rays[..., 0], rays[..., 1]
     r2 = u * u + v * v
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     across = 2 * u * v
     return np.stack(
         [

@@ -1,6 +1,7 @@
 """`jaxro calibrate` as its user meets it: reports, files, bad input, and the road from
 raw coordinates of two non-metric photos to a model of the object."""
 
+import json
 import re
 
 import numpy as np
@@ -87,7 +88,7 @@ def test_the_figures_are_those_of_python(tmp_path):
     assert {path.name for path in out.iterdir()} == {
         *("cameras.csv", "stations.csv", "zones.csv", "residuals.csv"),
         *("variants.csv", "corrections.csv", "corrections.png", "residuals.png"),
-        "summary.json",
+        *("summary.json", "opencv.json"),
     }
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in out.glob("*.png"))
 
@@ -112,6 +113,13 @@ def test_the_figures_are_those_of_python(tmp_path):
         atol=1e-7,
     )
     check_corrections(found, rows(out / "corrections.csv"))
+    (told,) = json.loads((out / "opencv.json").read_text())["cameras"].values()
+    focal, principal = float(found.focal[0]), np.asarray(found.principal)
+    down = [1, float(found.frame.handedness)]
+    expected = [[focal, 0, principal[0]], [0, focal, (down * principal)[1]], [0, 0, 1]]
+    np.testing.assert_allclose(told["camera_matrix"], expected, rtol=1e-6, atol=1e-4)
+    np.testing.assert_allclose(told["distortion_coefficients"], 0, atol=1e-6)
+    assert told["rest_largest"] < 1e-5
 
 
 def check_corrections(found, nodes):

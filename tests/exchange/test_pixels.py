@@ -116,16 +116,18 @@ def test_stretching_the_rows_with_their_focal_length_changes_nothing():
     np.testing.assert_allclose(rotations[0], rotations[1], atol=1e-9)
 
 
-def test_distortion_is_that_of_opencv():
+@pytest.mark.parametrize("rational", [(), (0.05, -0.02, 0.01)], ids=["five", "eight"])
+def test_distortion_is_that_of_opencv(rational):
     cv2 = pytest.importorskip("cv2", reason="OpenCV corrects distortion itself")
     pixels = both_photos(scene.DISTORTION)[0]
+    distortion = (*scene.DISTORTION, *rational)
     criteria = (3, 200, 1e-15)
     told = cv2.undistortPoints(
-        pixels[:, None], scene.K_LEFT, np.array(scene.DISTORTION), criteria=criteria
+        pixels[:, None], scene.K_LEFT, np.array(distortion), criteria=criteria
     )[:, 0]
     matrix = scene.K_LEFT.copy()
     matrix[0, 1] = 0  # OpenCV leaves the skew out
-    found = to_photo(pixels, matrix, scene.DISTORTION)
+    found = to_photo(pixels, matrix, distortion)
     np.testing.assert_allclose(found.x / found.focal, told[:, 0], atol=1e-12)
     np.testing.assert_allclose(-found.y / found.focal, told[:, 1], atol=1e-12)
 

@@ -178,7 +178,7 @@ Out = Annotated[
         "--out",
         "-o",
         help="Folder for cameras.csv, stations.csv, zones.csv, corrections.csv, "
-        "residuals.csv, points.csv, variants.csv, difference.csv and pictures.",
+        "residuals.csv, points.csv, variants.csv, difference.csv, opencv.json and pictures.",
         metavar="DIR",
         show_default=False,
     ),
