@@ -27,7 +27,6 @@ class Places:
     common: CommonPoints
     sigma: str
     sigma_known: bool
-    warnings: tuple[str, ...] = ()
 
 
 def are_given(options: request.Options) -> bool:
@@ -49,6 +48,7 @@ def read(options: request.Options) -> Places:
         options, has_sigma, str(options.file), request.SYSTEMS["relative"]
     )
     cameras = request.read_cameras(options, request.MEASURED)
+    _check_cameras(rows, cameras)
     block = _block(rows, cameras)
     common = choose_pairs(common_points(block), len(block.photos))
     if not len(common.left):
@@ -65,6 +65,20 @@ def read(options: request.Options) -> Places:
     block = block._replace(sigma=block.sigma * (1.0 if has_sigma else unit))
     known = has_sigma or options.sigma not in (None, deviation.AUTO)
     return Places(block, common, stated, known)
+
+
+def _check_cameras(rows: list[Row], cameras: Cameras) -> None:
+    """Raises TableError where the table names several cameras and only one is given."""
+    of_rows = [row.cells.get("camera") for row in rows]
+    if cameras.photos or len(set(of_rows)) == 1:
+        return
+    other = next(row for row in rows if row.cells["camera"] != of_rows[0])
+    raise other.error(
+        "camera",
+        found=f"{other.cells['camera']!r} beside {of_rows[0]!r}",
+        expected="a table [photo.NAME] for each photo in --camera, where these are of "
+        "several cameras",
+    )
 
 
 def in_photos(

@@ -155,7 +155,6 @@ def _of_places(options: Options) -> Task:
         bars=_bars(options),
         approximate=approximate,
         photo_unit=options.measured.unit,
-        warnings=measured.warnings,
     )
 
 

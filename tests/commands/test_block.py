@@ -213,27 +213,24 @@ def test_a_row_for_each_place_is_the_same_block(tables, written, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "more", "said"),
+    ("rows", "more", "said"),
     [
-        ("1,a,0,0\n2,a,5,0\n", (), "found no two of 2 photos with 6 points in common"),
-        ("1,a,0,0\n1,a,5,0\n", (), "line 3, column point: found 'a' a second time"),
-        ("1,a,0,0\n", ("--rays", "RAYS"), "--rays: found it beside"),
-        (
-            "1,a,0,0\n",
-            ("--camera", "OTHER"),
-            "column photo: found '1'; expected a photo",
-        ),
+        (["1,a,0,0,A", "2,a,5,0,A"], (), "found no two of 2 photos with 6 points in"),
+        (["1,a,0,0,A", "1,a,5,0,A"], (), "line 3, column point: found 'a' a second"),
+        (["1,a,0,0,A", "2,a,5,0,B"], (), "column camera: found 'B' beside 'A'"),
+        (["1,a,0,0,A"], ("--rays", "RAYS"), "--rays: found it beside"),
+        (["1,a,0,0,A"], ("--camera", "OTHER"), "column photo: found '1'; expected a"),
     ],
 )
-def test_places_that_make_no_block(text, more, said, tmp_path):
-    table = write(tmp_path, "photo,point,x,y\n" + text, "places.csv")
+def test_places_that_make_no_block(rows, more, said, tmp_path):
+    text = "\n".join(["photo,point,x,y,camera", *rows])
+    table = write(tmp_path, text, "places.csv")
     files = {
         "RAYS": write(tmp_path, "photo,point,x,y\n1,b,1,1\n", "rays.csv"),
         "OTHER": write(tmp_path, "[photo.7]\nfocal = 153\n", "camera.toml"),
     }
-    more = [files.get(value, value) for value in more]
     focal = () if "--camera" in more else ("--focal", "153")
-    told = run("block", table, *focal, *more)
+    told = run("block", table, *focal, *(files.get(value, value) for value in more))
     assert told.exit_code == 2 and said in words(told.stderr), told.stderr
 
 
