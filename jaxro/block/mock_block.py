@@ -115,7 +115,7 @@ def pairs_of(
     """All pairs of photos with so many points in common, in random order and direction:
     what `measured_block.from_pairs` takes."""
     rng = np.random.default_rng(seed)
-    common = common_points(block)
+    common = common_points(block.photo, block.point, len(block.photos))
     order = rng.permutation(np.flatnonzero(common.counts >= fewest))
     chosen = common.take(order)
     turned = rng.random(len(order)) < 0.5

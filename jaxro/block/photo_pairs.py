@@ -56,20 +56,23 @@ class CommonPoints(NamedTuple):
         )
 
 
-def common_points(block: MeasuredBlock) -> CommonPoints:
-    """All pairs of photos that see a point in common, left before right."""
-    by_point = np.lexsort((block.photo, block.point))
-    point, rows = block.point[by_point], []
+def common_points(
+    photo: Int[np.ndarray, " ray"], point: Int[np.ndarray, " ray"], photos: int
+) -> CommonPoints:
+    """All pairs of photos that see a point in common, left before right, of rays by the
+    numbers of their photo and their point."""
+    by_point = np.lexsort((photo, point))
+    point, rows = point[by_point], []
     for lag in range(1, len(point)):
         same = np.flatnonzero(point[lag:] == point[:-lag])
         if len(same) == 0:
             break
         rows.append(np.stack([by_point[same], by_point[same + lag]]))
     one, other = np.concatenate([np.zeros((2, 0), int), *rows], axis=1)
-    key = block.photo[one] * len(block.photos) + block.photo[other]
+    key = photo[one] * photos + photo[other]
     by_pair = np.argsort(key, kind="stable")
     keys, begins = np.unique(key[by_pair], return_index=True)
-    left, right = np.divmod(keys, max(len(block.photos), 1))
+    left, right = np.divmod(keys, max(photos, 1))
     begins = np.append(begins, len(key))
     return CommonPoints(left, right, begins, one[by_pair], other[by_pair])
 

@@ -7,15 +7,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ..block.measured_block import MeasuredBlock
-from ..block.photo_pairs import FEWEST, CommonPoints, choose_pairs, common_points
-from ..exchange import files
+from ..block.photo_pairs import CommonPoints, choose_pairs, common_points
 from ..geometry.pairs import Camera
 from ..reports.terminal import say_what
-from ..tables import images, whole
+from ..tables import images
 from ..tables.cameras import Cameras
-from ..tables.fields import TableError
 from ..tables.survey_checks import Row
 from . import request, sigma as deviation
+from .places import no_pairs
 
 
 @dataclass(frozen=True)
@@ -27,15 +26,6 @@ class Places:
     common: CommonPoints
     sigma: str
     sigma_known: bool
-
-
-def are_given(options: request.Options) -> bool:
-    """Whether the file of the user has a row for each place. Raises TableError where it
-    cannot be read."""
-    file = options.file
-    if file is None or whole.is_parquet(file) or files.is_of_other_program(file):
-        return False
-    return images.are_places(file)
 
 
 def read(options: request.Options) -> Places:
@@ -50,13 +40,11 @@ def read(options: request.Options) -> Places:
     cameras = request.read_cameras(options, request.MEASURED)
     _check_cameras(rows, cameras)
     block = _block(rows, cameras)
-    common = choose_pairs(common_points(block), len(block.photos))
+    common = choose_pairs(
+        common_points(block.photo, block.point, len(block.photos)), len(block.photos)
+    )
     if not len(common.left):
-        raise TableError(
-            options.file,
-            found=f"no two of {len(block.photos)} photos with {FEWEST} points in common",
-            expected="the same name for the same point on all photos",
-        )
+        raise no_pairs(options.file, len(block.photos))
     unit, stated = deviation.parse(options.sigma), "to the given standard deviations"
     if not has_sigma and unit is None:
         with say_what("Finding the standard deviation of the photo coordinates ..."):

@@ -30,6 +30,7 @@ from ..tables.measured import Table, to_list
 from . import block_places, request
 from .block_pairs import is_sigma_given, measure, read_pairs
 from .block_places import in_photos
+from .places import are_in, pair_names
 
 RADIAL = ("k1", "k2", "k3")
 INNER = ("focal", "principal", *RADIAL, "tangential", "affinity")
@@ -102,7 +103,7 @@ def prepare(options: Options) -> tuple[Task, dict[str, str | bytes]]:
     _check(options)
     if options.measured.file is None:
         return _simulate(options)
-    if block_places.are_given(options.measured):
+    if are_in(options.measured.file):
         return _of_places(options), {}
     own, table, cameras = read_pairs(options.measured)
     left, right = cameras.photos_of(
@@ -143,7 +144,7 @@ def _of_places(options: Options) -> Task:
     left, right = name(common.left), name(common.right)
     return Task(
         title=str(options.measured.file),
-        names=[f"{one}-{other}" for one, other in zip(left, right, strict=True)],
+        names=pair_names(left, right),
         left=left,
         right=right,
         pairs=common.as_pairs(block),

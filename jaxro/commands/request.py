@@ -18,7 +18,7 @@ from ..tables import cameras as camera_files, csv as csv_tables, whole
 from ..tables.examples import pair as example
 from ..tables.fields import TableError
 from ..tables.measured import Table
-from . import sigma as deviation
+from . import places, sigma as deviation
 from .documents import NO_DOCUMENTS, Documents
 
 SYSTEMS: dict[str, type[AbstractElements]] = {
@@ -70,6 +70,8 @@ MEASURED = Example(example.NAME, example.FOCAL, example.TABLE)
 def read_table(options: Options) -> Table:
     """All pairs of a table together, CSV or Parquet. Raises TableError."""
     assert options.file is not None
+    if places.are_in(options.file):
+        return places.read(options.file)
     if not whole.is_parquet(options.file):
         return csv_tables.read(options.file)
     from ..tables import parquet

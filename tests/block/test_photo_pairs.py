@@ -28,7 +28,7 @@ def test_common_points_are_those_of_sets():
     rng = np.random.default_rng(1)
     sets = [rng.choice(60, rng.integers(1, 30), replace=False) for _ in range(12)]
     block = seen(sets)
-    common = common_points(block)
+    common = common_points(block.photo, block.point, len(block.photos))
     found = {}
     for k, (left, right) in enumerate(zip(common.left, common.right, strict=True)):
         rows = slice(common.begins[k], common.begins[k + 1])
@@ -51,7 +51,9 @@ def test_of_many_photos_each_has_few_pairs_and_all_are_joined():
     one, other = np.arange(100), np.arange(100, 180)
     between = np.concatenate([one[:FEWEST], other[:FEWEST]])
     block = seen([one] * 40 + [other] * 40 + [between])
-    chosen = choose_pairs(common_points(block), 81)
+    chosen = choose_pairs(
+        common_points(block.photo, block.point, len(block.photos)), 81
+    )
     assert len(chosen.left) <= 81 * PARTNERS
     joined = {0}
     for _ in range(5):

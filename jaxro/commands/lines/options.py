@@ -50,7 +50,8 @@ Version = Annotated[
 
 COLUMNS = (
     "CSV table with the columns point,x_left,y_left,x_right,y_right (or "
-    "id,xl,yl,xr,yr) and optionally pair, sigma; or pairs of other programs: FILE.h5, "
+    "id,xl,yl,xr,yr) and optionally pair, sigma; or one row for each place, "
+    "photo,point,x,y; or pairs of other programs: FILE.h5, "
     "Bundler's FILE.out, the folder of a COLMAP text model."
 )
 
