@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,14 +36,13 @@ def read(file: Path) -> Table:
     column = lambda name, of: np.array([rows[k].cells[name] for k in of], float)
     sides = (common.one, common.other)
     numbers = [column(axis, of) for of in sides for axis in ("x", "y")]
-    table = dict(zip(COORDINATES, numbers, strict=True))
+    table: dict[str, Any] = dict(zip(COORDINATES, numbers, strict=True))
     if "sigma" in rows[0].cells:
-        sigma = [column("sigma", of) for of in sides]
-        if np.array_equal(*sigma):
-            table["sigma"] = sigma[0]
+        one, other = (column("sigma", of) for of in sides)
+        if np.array_equal(one, other):
+            table["sigma"] = one
         else:
-            of_coordinates = (sigma[0], sigma[0], sigma[1], sigma[1])
-            table |= dict(zip(DEVIATIONS, of_coordinates, strict=True))
+            table |= dict(zip(DEVIATIONS, (one, one, other, other), strict=True))
     return Table(
         file=str(file),
         names=np.array(pair_names(left, right), object),
