@@ -62,7 +62,7 @@ MOST = 0.5
 
 INDEPENDENT = 1.4
 """Independent tests for each degree of freedom that reject as often as those of a block:
-with them the largest w of 4,800 blocks without errors, of six to ten photos, was beyond
+with them the largest w of 4,726 blocks without errors, of six to ten photos, was beyond
 the limit of 5 % in 5.0 ± .3 %."""
 
 UNCHECKED = 0.02

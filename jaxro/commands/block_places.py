@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ..block.measured_block import MeasuredBlock
-from ..block.photo_pairs import CommonPoints, choose_pairs, common_points
+from ..block.photo_pairs import CommonPoints
 from ..geometry.pairs import Camera
 from ..reports.terminal import say_what
 from ..tables import images
 from ..tables.cameras import Cameras
 from ..tables.survey_checks import Row
 from . import request, sigma as deviation
-from .places import no_pairs
+from .places import Numbered, check_one_camera, number
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,11 @@ def read(options: request.Options) -> Places:
         options, has_sigma, str(options.file), request.SYSTEMS["relative"]
     )
     cameras = request.read_cameras(options, request.MEASURED)
-    _check_cameras(rows, cameras)
-    block = _block(rows, cameras)
-    common = choose_pairs(
-        common_points(block.photo, block.point, len(block.photos)), len(block.photos)
-    )
-    if not len(common.left):
-        raise no_pairs(options.file, len(block.photos))
+    if not cameras.photos:
+        check_one_camera(rows)
+    measured = in_photos(rows, cameras)
+    numbered = number(rows, options.file)
+    block, common = _block(rows, cameras, numbered, *measured), numbered.common
     unit, stated = deviation.parse(options.sigma), "to the given standard deviations"
     if not has_sigma and unit is None:
         with say_what("Finding the standard deviation of the photo coordinates ..."):
@@ -53,20 +51,6 @@ def read(options: request.Options) -> Places:
     block = block._replace(sigma=block.sigma * (1.0 if has_sigma else unit))
     known = has_sigma or options.sigma not in (None, deviation.AUTO)
     return Places(block, common, stated, known)
-
-
-def _check_cameras(rows: list[Row], cameras: Cameras) -> None:
-    """Raises TableError where the table names several cameras and only one is given."""
-    of_rows = [row.cells.get("camera") for row in rows]
-    if cameras.photos or len(set(of_rows)) == 1:
-        return
-    other = next(row for row in rows if row.cells["camera"] != of_rows[0])
-    raise other.error(
-        "camera",
-        found=f"{other.cells['camera']!r} beside {of_rows[0]!r}",
-        expected="a table [photo.NAME] for each photo in --camera, where these are of "
-        "several cameras",
-    )
 
 
 def in_photos(
@@ -99,14 +83,16 @@ def _camera(row: Row, cameras: Cameras) -> Camera:
     return camera
 
 
-def _block(rows: list[Row], cameras: Cameras) -> MeasuredBlock:
-    """The block of the rows; sigma is one pixel where the table has none. Raises
-    TableError."""
-    places, sigma = in_photos(rows, cameras)
-    names = lambda column: np.unique(
-        [row.cells[column] for row in rows], return_inverse=True
-    )
-    (photos, photo), (points, point) = names("image"), names("point")
+def _block(
+    rows: list[Row],
+    cameras: Cameras,
+    numbered: Numbered,
+    places: Float[np.ndarray, "row 2"],
+    sigma: Float[np.ndarray, " row"],
+) -> MeasuredBlock:
+    """The block of rows with these photo coordinates; sigma is one pixel where the table
+    has none."""
+    photos, points, photo, point, _ = numbered
     of_photo = dict(zip(photo.tolist(), rows, strict=True))
     own = [_camera(of_photo[k], cameras) for k in range(len(photos))]
     size = np.array([camera.pixel_size for camera in own])

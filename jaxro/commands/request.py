@@ -71,7 +71,7 @@ def read_table(options: Options) -> Table:
     """All pairs of a table together, CSV or Parquet. Raises TableError."""
     assert options.file is not None
     if places.are_in(options.file):
-        return places.read(options.file)
+        return places.read(options.file, one_camera=options.camera is None)
     if not whole.is_parquet(options.file):
         return csv_tables.read(options.file)
     from ..tables import parquet

@@ -180,7 +180,6 @@ def test_rays_that_stand_in_the_pairs_count_once(tables, written, tmp_path):
     assert "stand in" in told.stderr and "counts once" in words(told.stderr)
 
 
-@pytest.mark.slow
 def places_of(pairs):
     """The places of a table of pairs, each once."""
     places = {}
@@ -234,6 +233,7 @@ def test_places_that_make_no_block(rows, more, said, tmp_path):
     assert told.exit_code == 2 and said in words(told.stderr), told.stderr
 
 
+@pytest.mark.slow
 def test_stations_inner_parameters_and_components(tables, written, tmp_path):
     """Stations are rows of the ground with this role; a wrong focal length is found."""
     plain = json.loads((written / "summary.json").read_text())

@@ -179,8 +179,8 @@ LENS = "focal,principal,k1,k2,k3,tangential,affinity"
 @pytest.mark.slow
 def test_a_network_of_places_is_that_of_its_report(data, tmp_path):
     """Twenty-one photos of a target field, four known points, a row for each place, the
-    camera unknown: focal length, stations and deviations of DBAT's report, whose known
-    points have no errors, within these."""
+    camera unknown: the focal length of DBAT's report, and its stations within three of our
+    deviations. Its known points have no errors."""
     folder = data / "olympus_camcal"
     lines = lambda name: [
         [cell.strip() for cell in line.split(",")]
