@@ -19,10 +19,12 @@ from ..adjustment.sparse import (
     with_room,
 )
 from ..calibration.camera import Station
+from ..calibration.field import Field
 from ..xla.programs import compiled
 from .bars import Bars, no_bars
+from .displacements import FoundField, of_rays, read_fields
 from .given import Given
-from .inner import Inner, InnerParameters, cameras_of, in_photo_units
+from .inner import Inner, InnerParameters, cameras_of, in_photo_units, own_blocks
 from .measured_block import Ground, MeasuredBlock
 from .network import (
     Frame,
@@ -170,10 +172,32 @@ class BlockAdjustment:
             raise ValueError("BlockAdjustment: no inner parameters are unknown")
         return in_photo_units(
             self.inner,
-            cameras_of(self.block.focal),
+            cameras_of(self.block),
             np.asarray(self.adjustment.parameters["camera"]),
-            self.sigma0**2 * self.adjustment.common_cofactor_of("camera"),
+            self._of_cameras,
         )
+
+    @cached_property
+    def _of_cameras(self) -> Float[np.ndarray, "all all"]:
+        """The covariance of the parameters of all cameras together."""
+        return self.sigma0**2 * self.adjustment.common_cofactor_of("camera")
+
+    @property
+    def field(self) -> Field | None:
+        """How smooth and how large the displacement fields of the cameras are, if they
+        have one."""
+        found = None if self.inner is None else self.inner.field
+        return found if isinstance(found, Field) else None
+
+    @cached_property
+    def fields(self) -> list[FoundField]:
+        """The displacement fields of the cameras, if they have one."""
+        if self.inner is None or self.field is None:
+            return []
+        found = np.asarray(self.adjustment.parameters["camera"])
+        own = own_blocks(self._of_cameras, len(found))
+        places = places_of(self.block)
+        return read_fields(self.inner, self.block, places, found, own)
 
     # ---------------------------------------------------------------------------------
     # residuals
@@ -211,7 +235,7 @@ class BlockAdjustment:
         ahead = np.concatenate([places, np.ones((rays, 1))], axis=1)
         scale = 1.0
         if self.inner.focal:
-            camera = cameras_of(self.block.focal).of_photo[self.block.photo]
+            camera = cameras_of(self.block).of_photo[self.block.photo]
             own = np.asarray(self.adjustment.parameters["camera"])
             scale = 1.0 + own[camera, :1]
         return places + self._misfits_at(here, ahead) / scale
@@ -220,11 +244,13 @@ class BlockAdjustment:
         self, stations: Station, points: Float[np.ndarray, "ray 3"]
     ) -> Float[np.ndarray, "ray 2"]:
         """The misfits of all rays from these stations to these points."""
-        block, own = self.block, ()
+        block, own, places = self.block, (), places_of(self.block)
+        seen = places
         if self.inner is not None:
-            camera = cameras_of(block.focal).of_photo[block.photo]
+            camera = cameras_of(block).of_photo[block.photo]
             own = (np.asarray(self.adjustment.parameters["camera"])[camera],)
-        data = with_room((stations, *own, points, places_of(block)))
+            seen = places, of_rays(self.inner, block, places)
+        data = with_room((stations, *own, points, seen))
         found = _misfits(*data, condition=ray_condition(self.inner))
         return np.asarray(found)[: len(block.photo)]
 

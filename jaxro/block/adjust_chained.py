@@ -16,6 +16,7 @@ from .components import (
     components_of,
     multiply,
 )
+from .field_choice import with_field
 from .given import Given, Wrong
 from .measured_block import Ground, MeasuredBlock
 from .network import Start
@@ -65,6 +66,7 @@ def _adjust(
 ) -> tuple[BlockAdjustment, Wrong, dict[str, Component]]:
     """The adjustment without what is wrong, and its variance components; with them, if
     they are asked for, what is wrong is looked for once more."""
+    given, start = with_field(given, start, level)
     adjusted, wrong = adjust_without_wrong(given, start, level)
     if not components or adjusted.result != RESULTS.successful:
         return adjusted, wrong, components_of(adjusted)

@@ -49,9 +49,11 @@ def components_of(adjusted: BlockAdjustment) -> dict[str, Component]:
     adjustment."""
     kinds = ["stations" if part.station[0] else "control" for part in adjusted.known]
     found = adjusted.adjustment
-    names = ["places", *kinds, *(("ties", "bars") if len(adjusted.bar_rows) else ())]
+    has_fields = adjusted.inner is not None and adjusted.inner.modes > 0
+    names = ["places", *kinds, *(("fields",) if has_fields else ())]
+    names += ["ties", "bars"] if len(adjusted.bar_rows) else []
     groups = zip(names, found.residuals, found.redundancy, strict=True)
-    return {name: _component(v, r) for name, v, r in groups if name != "ties"}
+    return {name: _component(v, r) for name, v, r in groups if name in GROUPS}
 
 
 def _component(white: np.ndarray, redundancy: np.ndarray) -> Component:

@@ -26,7 +26,7 @@ from .columns import EQUAL_HEIGHTS, UNCERTAIN, Altered, Cause, Known, alter
 from .confusable import tell_confusable
 from .contradictions import contradictions
 from .given import Given
-from .inner import Inner
+from .inner import MODES, MOST_FIELDS, Inner, cameras_of, names_of
 from .measured_block import Ground
 from .place import TooLittleControl, known_in_chain, place_known, similarities
 from .wrong import CLEAR
@@ -338,7 +338,8 @@ CAMERA = (
 
 
 def _of_cameras(given: Given) -> Iterator[Hypothesis]:
-    """Inner parameters that are not what was given."""
+    """Inner parameters that are not what was given, and a distortion of any form."""
+    yield from _of_field(given)
     if given.inner is not None:
         return
     for inner, name, said in CAMERA:
@@ -348,6 +349,28 @@ def _of_cameras(given: Given) -> Iterator[Hypothesis]:
 
         free = given._replace(inner=inner)
         yield Hypothesis(name, free, say, unknowns=len(inner.free))
+
+
+def _of_field(given: Given) -> Iterator[Hypothesis]:
+    """A distortion that no focal length and no lens has: of film, of a scan."""
+    inner = Inner() if given.inner is None else given.inner
+    if inner.field or cameras_of(given.block).number > MOST_FIELDS:
+        return
+
+    def say(outcome: Outcome) -> str:
+        largest = max(one.largest for one in outcome.adjusted.fields)
+        return (
+            "With a displacement field of the camera (--inner "
+            f"{','.join((*names_of(inner), 'field'))}), up to {largest:.2g} in the unit of "
+            "the photos, everything fits"
+        )
+
+    yield Hypothesis(
+        "field",
+        given._replace(inner=inner._replace(field=True)),
+        say,
+        unknowns=len(inner.free) + MODES,
+    )
 
 
 def _figures(adjusted: BlockAdjustment) -> str:
@@ -361,7 +384,7 @@ def _figures(adjusted: BlockAdjustment) -> str:
     return ", ".join(told)
 
 
-OF_MEASUREMENT = (*(name for _, name, _ in CAMERA), "sigma")
+OF_MEASUREMENT = (*(name for _, name, _ in CAMERA), "field", "sigma")
 """The names of hypotheses about how was measured."""
 
 HARMLESS = (*OF_MEASUREMENT, BAR_UNIT)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from ..calibration.field import Field
 from .bars import Bars, no_bars
 from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, nothing_known
@@ -19,6 +20,11 @@ class Given(NamedTuple):
     ground: Ground | None = None
     inner: Inner | None = None
     bars: Bars | None = None
+
+    def with_field(self, field: Field) -> "Given":
+        """The same, with a displacement field of its cameras."""
+        inner = Inner(False, False) if self.inner is None else self.inner
+        return self._replace(inner=inner._replace(field=field))
 
     @property
     def known(self) -> Ground:

@@ -22,7 +22,8 @@ points."""
 class MeasuredBlock(NamedTuple):
     """Places of points on photos, ray by ray; `photo` and `point` count from 0 in
     `photos` and `points`, the names. `focal`: of each photo; `sigma`: the standard
-    deviation of a coordinate of each ray."""
+    deviation of a coordinate of each ray; `cameras`: the name of the camera of each
+    photo, None where they are told by their focal lengths alone."""
 
     photos: tuple[str, ...]
     points: tuple[str, ...]
@@ -32,6 +33,7 @@ class MeasuredBlock(NamedTuple):
     y: Float[np.ndarray, " ray"]
     sigma: Float[np.ndarray, " ray"]
     focal: Float[np.ndarray, " photo"]
+    cameras: tuple[str, ...] | None = None
 
     def without(self, rays: Bool[np.ndarray, " ray"]) -> "MeasuredBlock":
         """The block without some rays; photos and points keep their numbers."""

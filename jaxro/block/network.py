@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..adjustment import Term
 from ..calibration.camera import Camera, Measured, Station, misfit, perspective
 from ..geometry import rotations as rot
+from .displacements import of_rays, prior_variance
 from .inner import Inner, OfRay, cameras_of
 from .measured_block import Ground, MeasuredBlock
 
@@ -57,8 +58,8 @@ def of_ray(station: Station, point: Float[Array, "3"], place: Float[Array, "2"])
     return misfit(perspective, station, ideal, seen)
 
 
-def of_coordinate(point: Float[Array, "3"], known: tuple[Array, Array]):
-    """The misfit of one known coordinate of a point."""
+def of_coordinate(point: Float[Array, " number"], known: tuple[Array, Array]):
+    """The misfit of one known coordinate of a point, or of another number."""
     return point[known[0]] - known[1]
 
 
@@ -213,21 +214,41 @@ def terms_of(
     units: Frame,
     inner: Inner | None = None,
 ) -> tuple[Term, ...]:
-    """The conditions of rays, and those of each part of the known coordinates."""
+    """The conditions of rays, those of each part of the known coordinates, and what is
+    known beforehand of displacement fields."""
     used = numbered.rays
     photo, point = block.photo[used], numbered.number[block.point[used]]
     touches = [("photo", photo), ("point", point)]
-    if inner is not None:
-        touches.insert(1, ("camera", cameras_of(block.focal).of_photo[photo]))
-    place = places_of(block)[used]
     variance = (block.sigma[used] / block.focal[photo]) ** 2
-    rays = Term(ray_condition(inner), place, variance, touches=touches)
-    return rays, *(_of_known(part, numbered, units) for part in parts)
+    places, fields = places_of(block), ()
+    seen = places[used]
+    if inner is not None:
+        cameras = cameras_of(block)
+        touches.insert(1, ("camera", cameras.of_photo[photo]))
+        seen = seen, of_rays(inner, block, places)[used]
+        variance = variance, None
+        if inner.modes:
+            fields = (_of_fields(inner, block),)
+    rays = Term(ray_condition(inner), seen, variance, touches=touches)
+    return rays, *(_of_known(part, numbered, units) for part in parts), *fields
+
+
+def _of_fields(inner: Inner, block: MeasuredBlock) -> Term:
+    """What is known beforehand of the fields of all cameras: each coefficient is zero
+    but for their strength."""
+    variance = prior_variance(inner, block)
+    camera, mode = np.indices(variance.shape).reshape(2, -1)
+    return Term(
+        of_coordinate,
+        (len(inner.free) + mode, np.zeros(len(mode))),
+        (None, variance.ravel()),
+        touches=[("camera", camera)],
+    )
 
 
 def ray_condition(inner: Inner | None) -> Callable:
     """The condition of one ray."""
-    return of_ray if inner is None else OfRay(inner)
+    return of_ray if inner is None else OfRay(inner.free)
 
 
 def places_of(block: MeasuredBlock) -> Float[np.ndarray, "ray 2"]:

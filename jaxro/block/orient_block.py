@@ -130,6 +130,8 @@ def adjust_and_judge(
     except TooLittleControl as error:
         refused = error
     if outcome is not None:
+        # the field of the cameras is known from here on
+        given = given._replace(inner=outcome.adjusted.inner)
         rest = given, outcome.adjusted, outcome.wrong
         suspicious = is_suspicious(*rest, sigma_known=sigma_known)
         of_ground = bool(np.any(outcome.wrong.control)) or stands_under_ground(

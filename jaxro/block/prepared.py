@@ -92,8 +92,8 @@ def prepare_block(
     points = units.inside(points[numbered.number >= 0])
     families = {"photo": stations, "point": points}
     if inner is not None:
-        cameras = cameras_of(block.focal).number
-        zero = np.zeros((cameras, len(inner.free)))
+        cameras = cameras_of(block).number
+        zero = np.zeros((cameras, inner.count))
         families["camera"] = zero if start.inner is None else start.inner
     terms = terms_of(block, numbered, parts, units, inner)
     rows, between = bars_in(bars, block, numbered)

@@ -309,6 +309,9 @@ def settle(prepared: Prepared) -> Minimum:
             scales = [_scale(s, c) for s, c in zip(sizes, scales, strict=True)]
             both = zip(sizes, scales, strict=True)
             weights = [(c**2 / (c**2 + s**2)) ** 2 for s, c in both]
+        # a field that is large is no wrong measurement
+        measured = 1 + len(prepared.known)
+        weights[measured:] = [np.ones_like(s) for s in sizes[measured:]]
         found = minimise(problem.weighted(weights), datum=datum, max_steps=2)
     return found._replace(problem=problem.at(found.problem), result=RESULTS.successful)
 
@@ -336,7 +339,8 @@ def _scale(sizes: Float[np.ndarray, " group"], before: float) -> float:
 def _far(prepared: Prepared, found: Minimum) -> Wrong:
     """What is beyond `CLEAR`."""
     wrong = nothing_wrong(Given(prepared.block, prepared.ground))
-    far, *of_known = [sizes > CLEAR for sizes in _sizes(found.problem)]
+    far, *others = [sizes > CLEAR for sizes in _sizes(found.problem)]
+    of_known = others[: len(prepared.known)]
     wrong.rays[prepared.numbered.rays] = far
     number = len(wrong.control)
     control = spread_known(prepared.known, of_known, number, False)

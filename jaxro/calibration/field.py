@@ -29,7 +29,8 @@ from .images import Places
 from .zones import Area
 
 MODES = 24
-"""Functions for each of dx and dy."""
+"""Functions for each of dx and dy of a single image. Those beyond them have .07 of the
+strength at the length .5, and less at larger ones."""
 
 NODES = 15
 """Nodes along each side of the square over which the functions are calculated."""
@@ -44,14 +45,14 @@ class Field(eqx.Module):
 
 
 @lru_cache
-def _functions(length: float) -> np.ndarray:
+def _functions(length: float, modes: int) -> np.ndarray:
     """(node, mode): what the covariances of a place with all nodes are multiplied with
     to give the functions there."""
     nodes = _nodes()
     apart = nodes[:, None] - nodes[None]
     covariance = np.exp(-0.5 * np.sum(apart**2, axis=2) / length**2)
     values, vectors = np.linalg.eigh(covariance)
-    strongest = np.argsort(values)[::-1][:MODES]
+    strongest = np.argsort(values)[::-1][:modes]
     values = np.maximum(values[strongest], 1e-9 * values.max())
     return vectors[:, strongest] / np.sqrt(values)
 
@@ -61,30 +62,33 @@ def _nodes() -> np.ndarray:
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
-def functions(u: Places, length: float) -> Float[Array, "point mode"]:
-    """The functions of the covariance at any places, each with the variance 1."""
+def functions(
+    u: Places, length: float, modes: int = MODES
+) -> Float[Array, "point mode"]:
+    """The strongest functions of the covariance at any places, each with the
+    variance 1."""
     apart = u[:, None] - jnp.asarray(_nodes())[None]
     covariance = jnp.exp(-0.5 * jnp.sum(apart**2, axis=2) / length**2)
-    return covariance @ jnp.asarray(_functions(length))
+    return covariance @ jnp.asarray(_functions(length, modes))
 
 
 def columns(
-    u: Places, area: Area, field: Field, brown: Brown | None
+    u: Places, area: Area, field: Field, brown: Brown | None, modes: int = MODES
 ) -> Float[Array, "point 2 mode"]:
     """dx and dy at any places for each coefficient of the field: first those of dx,
     then those of dy."""
     grid = area.grid
-    of_grid = _both(functions(grid, field.length)).reshape(-1, 2 * MODES)
+    of_grid = _both(functions(grid, field.length, modes)).reshape(-1, 2 * modes)
     imitated = jax.vmap(lambda place: _imitated(place, area, brown))
     of_area = imitated(grid).reshape(of_grid.shape[0], -1)
     normal = symmetric.inverse(of_area.T @ of_area).matrix
     part = normal @ (of_area.T @ of_grid)
-    return _both(functions(u, field.length)) - jnp.einsum(
+    return _both(functions(u, field.length, modes)) - jnp.einsum(
         "pci,ij->pcj", imitated(u), part
     )
 
 
-def _both(one: Float[Array, "point mode"]) -> Float[Array, "point 2 modes"]:
+def _both(one: Float[Array, "point mode"]) -> Float[Array, "point 2 two_modes"]:
     zero = jnp.zeros_like(one)
     along_x = jnp.concatenate([one, zero], axis=1)
     return jnp.stack([along_x, jnp.concatenate([zero, one], axis=1)], axis=1)

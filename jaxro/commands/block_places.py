@@ -28,8 +28,10 @@ class Places:
     sigma_known: bool
 
 
-def read(options: request.Options) -> Places:
-    """The block of a table of places. Raises TableError."""
+def read(options: request.Options, *, are_unknown: bool) -> Places:
+    """The block of a table of places; `are_unknown`: whether inner parameters of its
+    cameras are, so that one camera that is given may stand for several. Raises
+    TableError."""
     assert options.file is not None
     with say_what(f"Reading {options.file} ..."):
         rows = images.read_places(options.file)
@@ -37,8 +39,8 @@ def read(options: request.Options) -> Places:
     request.check_numbers(
         options, has_sigma, str(options.file), request.SYSTEMS["relative"]
     )
-    cameras = request.read_cameras(options, request.MEASURED)
-    if not cameras.photos:
+    cameras = request.read_cameras(options, request.MEASURED, may_be_named=True)
+    if not (cameras.photos or cameras.named or are_unknown):
         check_one_camera(rows)
     measured = in_photos(rows, cameras)
     numbered = number(rows, options.file)
@@ -71,6 +73,8 @@ def in_photos(
 def _camera(row: Row, cameras: Cameras) -> Camera:
     """The camera of a photo. Raises TableError where it has none."""
     name = row.cells["image"]
+    if cameras.named:
+        return _named(row, cameras)
     camera = cameras.of_photo(name)
     if camera is None:
         photos = ", ".join(cameras.photos)
@@ -81,6 +85,31 @@ def _camera(row: Row, cameras: Cameras) -> Camera:
         )
         raise row.error("photo", found=repr(name), expected=expected)
     return camera
+
+
+def _check_focal(
+    names: tuple[str, ...], cameras: list[Camera], of_photo: dict[int, Row]
+) -> None:
+    """Raises TableError where the photos of one camera are given with two."""
+    first: dict[str, Camera] = {}
+    for k, (name, camera) in enumerate(zip(names, cameras, strict=True)):
+        if first.setdefault(name, camera) != camera:
+            raise of_photo[k].error(
+                "camera",
+                found=f"{name!r} for photos with different entries in --camera",
+                expected=f"one camera by one name, as [camera.{name}] gives it",
+            )
+
+
+def _named(row: Row, cameras: Cameras) -> Camera:
+    """The camera that a row names. Raises TableError where there is none."""
+    expected = f"a camera of {cameras.file}: {', '.join(cameras.named)}"
+    if "camera" not in row.cells:
+        raise row.error("camera", found="no such column", expected=expected)
+    name = row.cells["camera"]
+    if name not in cameras.named:
+        raise row.error("camera", found=repr(name), expected=expected)
+    return cameras.named[name]
 
 
 def _block(
@@ -96,6 +125,11 @@ def _block(
     of_photo = dict(zip(photo.tolist(), rows, strict=True))
     own = [_camera(of_photo[k], cameras) for k in range(len(photos))]
     size = np.array([camera.pixel_size for camera in own])
+    names = None
+    if "camera" in rows[0].cells:
+        each = images.cameras_of(rows)
+        names = tuple(each[photo] for photo in map(str, photos))
+        _check_focal(names, own, of_photo)
     return MeasuredBlock(
         photos=tuple(map(str, photos)),
         points=tuple(map(str, points)),
@@ -105,4 +139,5 @@ def _block(
         y=places[:, 1],
         sigma=np.where(np.isnan(sigma), size[photo], sigma),
         focal=np.array([camera.focal for camera in own]),
+        cameras=names,
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..batches.ragged import Ragged
 from ..block.bars import Bars
-from ..block.inner import Inner
+from ..block.inner import MOST_FIELDS, Inner, cameras_of
 from ..block.measured_block import (
     Ground,
     MeasuredBlock,
@@ -33,7 +33,7 @@ from .block_places import in_photos
 from .places import are_in, pair_names
 
 RADIAL = ("k1", "k2", "k3")
-INNER = ("focal", "principal", *RADIAL, "tangential", "affinity")
+INNER = ("focal", "principal", *RADIAL, "tangential", "affinity", "field")
 """Inner parameters by the names of --inner; those of Brown stand for all below them."""
 
 EXACT = 1e-3
@@ -137,8 +137,16 @@ def _of_places(options: Options) -> Task:
             found=f"it beside {options.measured.file}, a table of places itself",
             expected="all places in one table",
         )
-    measured = block_places.read(options.measured)
+    are_unknown = options.inner is not None
+    measured = block_places.read(options.measured, are_unknown=are_unknown)
     block, common = measured.block, measured.common
+    number = cameras_of(block).number
+    if number > MOST_FIELDS and "field" in (options.inner or "").split(","):
+        raise TableError(
+            "--inner",
+            found=f"field for {number} cameras",
+            expected=f"at most {MOST_FIELDS} cameras with a displacement field",
+        )
     ground, approximate = _control(options)
     name = lambda photos: [block.photos[k] for k in photos]
     left, right = name(common.left), name(common.right)
@@ -244,6 +252,7 @@ def inner_of(given: str | None) -> Inner | None:
         radial=radial,
         tangential="tangential" in names,
         affinity="affinity" in names,
+        field="field" in names,
     )
 
 

@@ -94,8 +94,11 @@ def units_of(
     )
 
 
-def read_cameras(options: Options, otherwise: Example) -> camera_files.Cameras:
-    """The cameras of --camera, or the one of the single options."""
+def read_cameras(
+    options: Options, otherwise: Example, *, may_be_named: bool = False
+) -> camera_files.Cameras:
+    """The cameras of --camera, or the one of the single options; `may_be_named`: by
+    names that a column of the table has. Raises TableError."""
     single = {
         "--focal": options.focal,
         "--principal-point": options.principal_point,
@@ -110,7 +113,15 @@ def read_cameras(options: Options, otherwise: Example) -> camera_files.Cameras:
                     found="it beside --camera",
                     expected=f"this entry in {options.camera} instead",
                 )
-        return camera_files.read(options.camera)
+        found = camera_files.read(options.camera)
+        if found.named and not may_be_named:
+            raise TableError(
+                found.file,
+                found="cameras by names of their own",
+                expected="[photo.NAME] for every photo: only jaxro block, from a table "
+                "photo,point,x,y,camera, knows which camera took which photo",
+            )
+        return found
     focal = (
         otherwise.focal
         if options.file is None and options.focal is None

@@ -252,12 +252,35 @@ def show_cameras(console: Console, done: Done) -> None:
     found = done.adjusted.cameras
     rows = table("camera", "parameter", "value", "± sd", title="Inner parameters")
     rows.columns[1].justify = "left"
-    values = zip(found.values, found.deviations, strict=True)
-    for k, (own, deviations) in enumerate(values):
+    values = zip(found.cameras, found.values, found.deviations, strict=True)
+    for camera, own, deviations in values:
         for name, value, spread in zip(found.names, own, deviations, strict=True):
             cells = f"{value:.6g}", f"{spread:.2g}"
-            rows.add_row(str(k + 1), name, *cells)
+            rows.add_row(escape(camera), name, *cells)
+    if found.names:
+        console.print(rows)
+    _show_fields(console, done)
+
+
+def _show_fields(console: Console, done: Done) -> None:
+    """The displacement fields of the cameras."""
+    field, fields = done.adjusted.field, done.adjusted.fields
+    if field is None:
+        return
+    unit = done.photo_unit
+    rows = table(
+        "camera", "rms", "largest", "± sd", title=f"Displacement fields [{unit}]"
+    )
+    for one in fields:
+        spread = float(np.sqrt(np.mean(one.deviations**2)))
+        places = digits(spread)
+        cells = (number(value, places) for value in (one.rms, one.largest, spread))
+        rows.add_row(escape(one.camera), *cells)
     console.print(rows)
+    console.print(
+        f"They change over some {field.length:g} of half the photo, and are about "
+        f"{float(field.strength):.2g} standard deviations of a place: by the evidence"
+    )
 
 
 def show_photos(console: Console, done: Done) -> None:

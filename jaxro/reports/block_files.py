@@ -27,6 +27,7 @@ def tables(done: Done) -> dict[str, Columns]:
         "control": _control(done),
         "residuals": _residuals(done),
         "cameras": _cameras(done),
+        "fields": _fields(done),
         "bars": _bars(done),
         "photo_covariances": _photo_covariances(done),
         "point_covariances": _point_covariances(done),
@@ -74,6 +75,23 @@ def summary(done: Done) -> dict[str, Any]:
         "control_left_out": _names_left_out(done),
         "check_points": len(done.checks.names),
         "unit": done.unit,
+        "field": _field(done),
+    }
+
+
+def _field(done: Done) -> dict[str, Any] | None:
+    """How smooth and how large the displacement fields of the cameras are."""
+    found = done.adjusted.field if done.usable else None
+    if found is None:
+        return None
+    sizes = {
+        one.camera: {"rms": one.rms, "largest": one.largest}
+        for one in done.adjusted.fields
+    }
+    return {
+        "length": found.length,
+        "strength": float(found.strength),
+        "cameras": sizes,
     }
 
 
@@ -120,11 +138,25 @@ def _cameras(done: Done) -> Columns:
     found = done.adjusted.cameras
     number = len(found.names)
     return {
-        "camera": np.repeat(np.arange(len(found.values)) + 1, number),
+        "camera": np.repeat(np.array(found.cameras), number),
         "parameter": list(found.names) * len(found.values),
         "value": found.values.ravel(),
         "sd": found.deviations.ravel(),
     }
+
+
+def _fields(done: Done) -> Columns:
+    """The displacement field of each camera over its measured area: what is to be taken
+    off a place to have that of a camera without it."""
+    fields = done.adjusted.fields
+    if not fields:
+        return {"camera": []}
+    all_ = lambda of: np.concatenate([of(one) for one in fields])
+    names = [np.repeat(np.array([one.camera]), len(one.places)) for one in fields]
+    table: Columns = {"camera": np.concatenate(names)}
+    table |= _with_names(("x", "y"), all_(lambda one: one.places))
+    table |= _with_names(("dx", "dy"), all_(lambda one: one.displacements))
+    return table | _with_names(("s_dx", "s_dy"), all_(lambda one: one.deviations))
 
 
 def _bars(done: Done) -> Columns:

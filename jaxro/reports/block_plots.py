@@ -8,6 +8,9 @@ from .. import plots
 from .block_model import Done
 from .control import Compared
 
+MOST = 6
+"""Cameras that a figure shows."""
+
 
 def figures(done: Done) -> dict[str, Any]:
     """The figures by name: the block on the ground, and the residuals of all photos in
@@ -15,7 +18,10 @@ def figures(done: Done) -> dict[str, Any]:
     if not done.usable:
         return {}
     drawn = {"block": draw(done), "block_residuals": draw_residuals(done)}
-    return {name: plots.figure_of(axes) for name, axes in drawn.items()}
+    found = {name: plots.figure_of(axes) for name, axes in drawn.items()}
+    if done.adjusted.fields:
+        found["fields"] = draw_fields(done)
+    return found
 
 
 def draw(done: Done) -> Any:
@@ -35,6 +41,24 @@ def draw(done: Done) -> Any:
 def draw_residuals(done: Done) -> Any:
     """The residuals of all photos in one."""
     return plots.draw_block_residuals(done.adjusted, unit=done.photo_unit)
+
+
+def draw_fields(done: Done) -> Any:
+    """The displacement field of each camera, of many the first."""
+    shown = done.adjusted.fields[:MOST]
+    figure = plots.new_figure(4.4 * len(shown), 5.2)
+    every = figure.subplots(len(shown), 1, squeeze=False).ravel()
+    for axes, one in zip(every, shown, strict=True):
+        spread = np.hypot(*one.deviations.T)
+        plots.draw_vectors(
+            one.places,
+            one.displacements,
+            in_deviations=np.hypot(*one.displacements.T) / spread,
+            unit=done.photo_unit,
+            title=f"Displacement field of camera {one.camera}",
+            axes=axes,
+        )
+    return figure
 
 
 def _known(kind: str, one: Compared) -> plots.KnownPoints:

@@ -1,8 +1,9 @@
-"""Cameras of a table's photos from TOML, in one of three forms:
+"""Cameras of a table's photos from TOML, in one of four forms:
 
     [camera]                              one camera for every photo
     [left] and [right]                    one for all left photos, one for all right ones
     [photo.NAME], one table a photo       pairs are then named LEFT-RIGHT or LEFT_RIGHT
+    [camera.NAME], one table a camera     for tables of places with the column camera
 
 Each table holds focal and, where they are not the defaults, principal_point = [0, 0],
 pixel_size = 1, y_down = false.
@@ -28,17 +29,22 @@ LARGEST = 1_000_000
 DOTS = 20
 """Points in a line of a camera file: those of a name and of two numbers."""
 
-FORMS = "[camera], or [left] and [right], or [photo.NAME] for every photo"
+FORMS = (
+    "[camera], or [left] and [right], or [photo.NAME] for every photo, or for a table of "
+    "places with the column camera [camera.NAME] for each of them"
+)
 
 
 @dataclass
 class Cameras:
-    """The cameras of the left and right photos, or of every photo by its name."""
+    """The cameras of the left and right photos, or of every photo by its name, or by
+    names of their own (`named`)."""
 
     file: str
     left: Camera | None = None
     right: Camera | None = None
     photos: dict[str, Camera] = field(default_factory=dict)
+    named: dict[str, Camera] = field(default_factory=dict)
 
     def of(
         self, name: str, file: str, line: int | str | None = None
@@ -212,6 +218,14 @@ def _cameras(path: Path, text: str, tables: dict[str, Any]) -> Cameras:
                 for n, t in tables["photo"].items()
             },
         )
+    if names == {"camera"} and _are_named(tables["camera"]):
+        return Cameras(
+            str(path),
+            named={
+                n: _camera(path, text, f"camera.{n}", t)
+                for n, t in tables["camera"].items()
+            },
+        )
     if names == {"camera"}:
         one = _camera(path, text, "camera", tables["camera"])
         return Cameras(str(path), one, one)
@@ -222,6 +236,13 @@ def _cameras(path: Path, text: str, tables: dict[str, Any]) -> Cameras:
         return Cameras(str(path), left, right)
     found = f"the entries {', '.join(tables)}" if tables else "no entries"
     raise TableError(path, found=found, expected=FORMS)
+
+
+def _are_named(entries: Any) -> bool:
+    """Whether the entries of [camera] are cameras themselves, [camera.NAME]."""
+    if not isinstance(entries, dict) or not entries:
+        return False
+    return all(isinstance(one, dict) for one in entries.values())
 
 
 def _camera(path: Path, text: str, table: str, entries: Any) -> Camera:

@@ -220,6 +220,15 @@ def _cameras(
     all, where the table does not tell it. Raises TableError for an image with two."""
     if "camera" not in measured[0].cells:
         return ["camera"], np.zeros(len(images), int)
+    found = cameras_of(measured)
+    of_images = [found[name] for name in images]
+    cameras = list(dict.fromkeys(of_images))
+    return cameras, np.array([cameras.index(name) for name in of_images])
+
+
+def cameras_of(measured: list[Row]) -> dict[str, str]:
+    """The name of the camera of each image, of a table that has them. Raises TableError
+    for an image with two."""
     first: dict[str, Row] = {}
     for row in measured:
         before = first.setdefault(row.cells["image"], row)
@@ -230,9 +239,7 @@ def _cameras(
                 f"line {before.line} for the same image {row.cells['image']!r}",
                 expected="one camera for each image",
             )
-    of_images = [first[name].cells["camera"] for name in images]
-    cameras = list(dict.fromkeys(of_images))
-    return cameras, np.array([cameras.index(name) for name in of_images])
+    return {name: row.cells["camera"] for name, row in first.items()}
 
 
 def _check_names(measured: list[Row], at: dict[str, int], other: str) -> None:

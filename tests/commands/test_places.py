@@ -4,7 +4,7 @@ import json
 
 import pytest
 from bad_tables import write
-from command_line import run
+from command_line import run, words
 
 from jaxro.tables.examples import pair as example
 
@@ -57,3 +57,26 @@ def test_photos_without_points_in_common_make_no_pair(tmp_path):
     told = run("clean", written(tmp_path, "photo,point,x,y", rows), *FOCAL)
     assert told.exit_code == 2
     assert "found no two of 2 photos with 6 points in common" in told.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "cells", "camera", "said"),
+    [
+        ("block", (",a", ",c"), "[camera.a]\nfocal = 3\n[camera.b]\nfocal = 4\n",
+         "column camera: found 'c'; expected a camera of"),
+        ("block", ("", ""), "[camera.a]\nfocal = 3\n",
+         "column camera: found no such column"),
+        ("block", (",a", ",a"), "[photo.A]\nfocal = 3\n[photo.B]\nfocal = 4\n",
+         "found 'a' for photos with different entries in --camera"),
+        ("clean", (",a", ",b"), "[camera.a]\nfocal = 3\n[camera.b]\nfocal = 4\n",
+         "found cameras by names of their own"),
+    ],
+)  # fmt: skip
+def test_cameras_that_do_not_fit_the_places(command, cells, camera, said, tmp_path):
+    left, right = cells
+    rows = places_of(example.TABLE, left=left, right=right)
+    header = "photo,point,x,y" + (",camera" if left else "")
+    file = write(tmp_path, camera, "camera.toml")
+    table = written(tmp_path, header, rows)
+    told = run(command, table, "--camera", file, "--sigma", "0.005")
+    assert told.exit_code == 2 and said in words(told.stderr)

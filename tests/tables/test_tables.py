@@ -90,6 +90,12 @@ def test_cameras_of_every_form(tmp_path):
     for text, focals in forms.items():
         both = cameras.read(write(tmp_path, text, "camera.toml")).of(name, "pairs.csv")
         assert tuple(camera.focal for camera in both) == focals
+    text = "[camera.wide]\nfocal = 3\n[camera.tele]\nfocal = 4"
+    named = cameras.read(write(tmp_path, text, "camera.toml")).named
+    assert {name: camera.focal for name, camera in named.items()} == {
+        "wide": 3,
+        "tele": 4,
+    }
     photos = cameras.read(
         write(tmp_path, "[photo.1]\nfocal = 3\n[photo.2]\nfocal = 4", "camera.toml")
     )

@@ -60,7 +60,8 @@ InnerNames = Annotated[
     typer.Option(
         "--inner",
         help="Inner parameters of the cameras that are unknown, too: some of "
-        "focal,principal,k1,k2,k3,tangential,affinity.",
+        "focal,principal,k1,k2,k3,tangential,affinity,field, the last a displacement "
+        "field of any smooth form.",
         metavar="NAME,...",
         show_default=False,
     ),
