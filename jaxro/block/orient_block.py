@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from ..batches.ragged import Ragged, clean_ragged
 from ..batches.table_noise import estimate
@@ -90,17 +90,17 @@ def orient_block(
     block = from_pairs(left, right, pairs, points) if more is None else more
     if bars is not None and not np.any(bars.are_in(block)):
         raise NoBar("orient_block: no bar has both of its points in the block")
-    rough = pairs if inner is None else _without_lens(pairs)
-    joined = join_pairs(block, left, right, rough)
+    start = pairs if inner is None else without_lens(pairs)
+    joined = join_pairs(block, left, right, start)
     given = Given(joined.block, ground, inner, bars)
     judged = adjust_and_judge(given, joined.chained, level, components, sigma_known)
     cause = joined.cause or judged.cause
     return OrientedBlock(*judged.outcome, joined.usable, judged.contradictions, cause)
 
 
-def _without_lens(pairs: Ragged) -> Ragged:
-    """The pairs with standard deviations that cover what unknown inner parameters do to
-    their places."""
+def without_lens(pairs: Ragged) -> Ragged:
+    """The pairs with standard deviations that cover what unknown inner parameters, bent
+    film, or deviations that are too small do to their places."""
     focal = np.repeat(np.minimum(pairs.focal_left, pairs.focal_right), pairs.lengths)
     return pairs._replace(sigma=np.maximum(pairs.sigma, LENS * focal))
 
@@ -222,22 +222,38 @@ def join_pairs(
     number = {name: k for k, name in enumerate(block.photos)}
     ends = [np.array([number[name] for name in side], int) for side in (left, right)]
     oriented, cause = _orient(pairs), None
-    mended = mend_photo(block, *ends, oriented, _orient)
+    mended = mend_photo(block, *ends, oriented, _orient, without_lens)
     if mended is not None:
         block, oriented, cause = mended
     try:
         chained = chain(block, models_of(*ends, oriented))
     except Unjoined:
-        # approximate values need no verdict, and the block is judged as a whole
-        more = oriented._replace(usable=_nearly_usable(oriented))
-        try:
-            chained = chain(block, models_of(*ends, more))
-        except Unjoined as error:
-            reason = _of_field(block) or _of_noise(pairs, oriented)
-            if reason is None:
-                raise
-            raise Unjoined(error.photos, reason.sentence) from None
+        chained = _chain_roughly(block, ends, pairs, oriented)
     return Joined(block, chained, np.asarray(oriented.usable), cause)
+
+
+def _chain_roughly(
+    block: MeasuredBlock,
+    ends: list[Int[np.ndarray, " pair"]],
+    pairs: Ragged,
+    oriented: Oriented,
+) -> Chained:
+    """The photos of a block chained by pairs that are refused as well, or oriented with
+    standard deviations that cover nearly all that may be wrong with a camera: approximate
+    values need no verdict, and the block is judged as a whole. Raises `Unjoined`."""
+    try:
+        more = oriented._replace(usable=_nearly_usable(oriented))
+        return chain(block, models_of(*ends, more))
+    except Unjoined as error:
+        refused = error
+    rough = _orient(without_lens(pairs))
+    try:
+        return chain(block, models_of(*ends, rough))
+    except Unjoined:
+        reason = _of_field(block) or _of_noise(pairs, oriented)
+        if reason is None:
+            raise refused from None
+        raise Unjoined(refused.photos, reason.sentence) from None
 
 
 def _nearly_usable(oriented: Oriented) -> Bool[np.ndarray, " pair"]:

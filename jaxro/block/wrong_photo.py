@@ -9,6 +9,7 @@ they came, or of the list by name; of places in a list of no order nothing is fo
 
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -49,26 +50,44 @@ def mend_photo(
     right: Int[np.ndarray, " pair"],
     oriented: Oriented,
     orient: Callable[[Ragged], Oriented],
+    roughly: Callable[[Ragged], Ragged],
 ) -> Mended | None:
     """The block without what is wrong with one photo as a whole, None where nothing is.
     `left`, `right`: the photos of the pairs, whose names are `block`'s; `orient`: how
-    pairs are oriented."""
+    pairs are oriented; `roughly`: pairs with standard deviations that cover all that may
+    be wrong with a camera."""
     for photo in _suspects(len(block.photos), left, right, oriented):
         own = np.flatnonzero((left == photo) | (right == photo))
+        some = partial(_pairs_of, left=left[own], right=right[own])
+        # names and axes are right where nearly all points are about where they should be
+        found = orient(roughly(some(block)))
+        if _fitting(found) > NEARLY_ALL * np.sum(found.points):
+            continue
         for mended, name, said in _hypotheses(block, photo):
-            ends = zip(left[own].tolist(), right[own].tolist(), strict=True)
-            rows = [_common(mended, one, other) for one, other in ends]
-            begins = np.cumsum([0, *map(len, rows)])
-            rays = np.concatenate(rows).T
-            pairs = pairs_of_rays(mended, begins, *rays, left[own], right[own])
-            found = orient(pairs)
-            fitting = int(np.sum(np.where(found.usable, found.kept, 0)))
-            points = len(rays[0])
+            found = orient(some(mended))
+            fitting, points = _fitting(found), int(np.sum(found.points))
             if fitting > NEARLY_ALL * points:
                 told = f"{said} {fitting} of the {points} points of its pairs fit"
                 every = _replace(oriented, own, found)
                 return Mended(mended, every, Cause(name, told))
     return None
+
+
+def _pairs_of(
+    block: MeasuredBlock,
+    left: Int[np.ndarray, " pair"],
+    right: Int[np.ndarray, " pair"],
+) -> Ragged:
+    """The pairs of these photos of a block, by the points that they have in common."""
+    ends = zip(left.tolist(), right.tolist(), strict=True)
+    rows = [_common(block, one, other) for one, other in ends]
+    begins = np.cumsum([0, *map(len, rows)])
+    return pairs_of_rays(block, begins, *np.concatenate(rows).T, left, right)
+
+
+def _fitting(oriented: Oriented) -> int:
+    """The points that fit."""
+    return int(np.sum(np.where(oriented.usable, oriented.kept, 0)))
 
 
 def _suspects(
