@@ -34,6 +34,7 @@ from .normal_equations import SINGULAR
 from .results import RESULTS
 from .sparse_factor import (
     Carried,
+    CofactorMatrix,
     Cofactors,
     Datum,
     Factored,
@@ -131,11 +132,15 @@ class SparseAdjustment:
     result: RESULTS
     problem: Problem
     datum: DatumOf | None
+    referred: CofactorMatrix | None = None
 
     @cached_property
-    def all_cofactors(self) -> Cofactors:
+    def all_cofactors(self) -> CofactorMatrix:
         """The cofactor matrix of all parameters, of which any columns can be had. The
-        normal equations are made and factorised once more. Raises `Singular`."""
+        normal equations are made and factorised once more, unless the network was
+        `referred` to another datum. Raises `Singular`."""
+        if self.referred is not None:
+            return self.referred
         problem = self.problem
         system = _System(problem, self.datum)
         factored, _, carried = system.factorise(_origin(problem), jnp.zeros(()))
@@ -319,7 +324,7 @@ class _System:
             self.problem.roles,
             self.problem.members,
         )
-        found = self.datum(trimmed(displaced(data, steps), members))  # pyright: ignore[reportOptionalCall]
+        found = self.datum(trimmed(displace(data.families, steps), members))  # pyright: ignore[reportOptionalCall]
         missing = roles.blocks - found.rows.shape[1]
         return found._replace(rows=np.pad(found.rows, ((0, 0), (0, missing), (0, 0))))
 
@@ -360,7 +365,7 @@ def minimise(
         done = bool(state.done)
     if done:
         result = RESULTS.successful
-    data = problem.data._replace(families=displaced(problem.data, steps))
+    data = problem.data._replace(families=displace(problem.data.families, steps))
     return Minimum(problem._replace(data=data), number, result)
 
 
@@ -451,8 +456,3 @@ def trimmed(families: dict[str, Any], members: dict[str, int]) -> dict[str, Any]
         name: jax.tree.map(lambda a, n=members[name]: np.asarray(a)[:n], family)
         for name, family in families.items()
     }
-
-
-def displaced(data: Data, steps: Steps) -> dict[str, Any]:
-    """The families after a displacement, in their standard form."""
-    return displace(data.families, steps)

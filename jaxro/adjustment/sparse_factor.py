@@ -6,7 +6,7 @@ Everything here is NumPy on the host: it calls LAPACK, which compiled programs m
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -329,6 +329,24 @@ def _inverse(matrix: Float[np.ndarray, "c c"]) -> tuple[np.ndarray, float]:
         raise Singular from None
     half = np.linalg.inv(factor) / scale
     return half.T @ half, float(np.min(np.diagonal(factor)) ** 2)
+
+
+@runtime_checkable
+class CofactorMatrix(Protocol):
+    """The cofactors of all parameters: linked, common, eliminated."""
+
+    def times(self, right: Float[np.ndarray, "row k"]) -> Float[np.ndarray, "row k"]:
+        """The matrix times some columns."""
+        ...
+
+    def between(self, rows: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
+        """Its part between some parameters."""
+        ...
+
+    @property
+    def number(self) -> int:
+        """Of all parameters."""
+        ...
 
 
 class Cofactors:

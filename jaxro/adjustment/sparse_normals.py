@@ -287,6 +287,19 @@ def read_solution(solved: tuple[Carried, Solved], data: Data, *, roles: Roles) -
     return Read(points.own, redundancy, shifts)
 
 
+def along_rows(
+    values: dict[str, Float[Array, "_ _ _"]], data: Data, roles: Roles
+) -> list[Float[Array, "_ _ _"]]:
+    """A times columns of all parameters, given by families, of each term."""
+    found = []
+    for term in data.terms:
+        part = linearise(term, data.families, origin(data, roles))
+        columns = zip(term.touches, part.columns, strict=True)
+        each = [_times(a, values[name][member]) for (name, member), a in columns]
+        found.append(jnp.sum(jnp.stack(each), axis=0))
+    return found
+
+
 def _of_points(carried: Carried, known: Solved, of: Pattern) -> OfPoints:
     """Q_yx = -V⁻¹ (W Q_xx + X Q_cx), and so on, for the points."""
     inverse, x, w = carried.inverse, carried.x, carried.w

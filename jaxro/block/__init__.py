@@ -32,6 +32,7 @@ from .covariance import (
     joint_covariance as joint_covariance,
     relative_covariance as relative_covariance,
 )
+from .datum_of_points import refer_to_points as refer_to_points
 from .given import Given as Given, Wrong as Wrong
 from .inner import Inner as Inner
 from .measured_block import (

@@ -2,18 +2,18 @@
 
 from rich.console import Console
 
+from ..adjustment import RESULTS
 from ..block.bars import NoBar
 from ..block.chain import Unjoined
-from ..block.orient_block import orient_block
+from ..block.datum_of_points import refer_to_points
+from ..block.orient_block import OrientedBlock, orient_block
 from ..block.place import TooLittleControl
 from ..reports import block as report, block_comparisons as comparisons, block_plots
 from ..reports.block_files import contents, summary
-from ..reports.block_model import Done
+from ..reports.block_model import PHOTOS, POINTS, Done
 from ..reports.html.block import page_of_block
 from ..reports.terminal import consoles, say_what, warn
-from ..tables import (
-    whole,
-)
+from ..tables import whole
 from ..tables.fields import TableError
 from . import block_other_ways as other_ways
 from .block_request import Options, Task, inner_of, prepare, some_of
@@ -139,6 +139,7 @@ def calculate(task: Task, options: Options) -> Done:
             found="no bar with both of its points on two photos or more",
             expected=f"names of {task.title}: {some_of(sorted(set(task.points)))}",
         ) from error
+    oriented = _refer(oriented, options.datum)
     network = task.ground is None and task.bars is None
     return Done(
         title=task.title,
@@ -150,4 +151,21 @@ def calculate(task: Task, options: Options) -> Done:
         ground=task.ground,
         bars=task.bars,
         approximate=task.approximate,
+        datum=options.datum or PHOTOS,
     )
+
+
+def _refer(oriented: OrientedBlock, datum: str | None) -> OrientedBlock:
+    """The block on the datum that is asked for. Raises TableError."""
+    adjusted = oriented.adjusted
+    if datum in (None, PHOTOS) or adjusted.result != RESULTS.successful:
+        return oriented
+    names = None if datum == POINTS else [name.strip() for name in datum.split(",")]
+    try:
+        return oriented._replace(adjusted=refer_to_points(adjusted, names))
+    except ValueError as error:
+        raise TableError(
+            "--datum",
+            found=str(error).removeprefix("refer_to_points: "),
+            expected="photos, points, or names of points",
+        ) from None

@@ -51,6 +51,7 @@ class Options:
     rays: Path | None = None
     bars: Path | None = None
     inner: str | None = None
+    datum: str | None = None
     components: bool = False
     conditions: bool = False
     classical: bool = False
@@ -186,6 +187,13 @@ def _check(options: Options) -> None:
             "--control-sigma", found=repr(value), expected="a positive number"
         )
     inner_of(options.inner)
+    if options.datum is not None and (options.control is not None or own.file is None):
+        beside = "--control" if options.control is not None else "no table"
+        raise TableError(
+            "--datum",
+            found=f"it beside {beside}",
+            expected="a free network: known points hold the others",
+        )
     for name, asked in (
         ("--conditions", options.conditions),
         ("--classical", options.classical),

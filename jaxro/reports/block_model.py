@@ -38,6 +38,10 @@ class LeftOut(NamedTuple):
     ratio: float
 
 
+PHOTOS, POINTS = "photos", "points"
+"""The datum of a free network, but for some points by their names."""
+
+
 @dataclass(frozen=True)
 class Done:
     """A finished block.
@@ -46,7 +50,8 @@ class Done:
     `pairs`: the names of the pairs; `ground`: all that is known of it, None for a free
     network; `bars`: all that were given; `approximate`: how many of the known points are
     no more than that; `sigma`: how the standard deviation of the photo coordinates came
-    about, in words.
+    about, in words; `datum`: what the deviations of a free network refer to, photos,
+    points, or some points by their names.
     """
 
     title: str
@@ -58,6 +63,7 @@ class Done:
     ground: Ground | None
     bars: Bars | None = None
     approximate: int = 0
+    datum: str = PHOTOS
 
     @property
     def adjusted(self) -> BlockAdjustment:

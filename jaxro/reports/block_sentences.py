@@ -4,7 +4,7 @@ import numpy as np
 
 from ..block.contradictions import stands_under_ground
 from ..block.photos import find_copies
-from .block_model import Done
+from .block_model import PHOTOS, POINTS, Done
 from .control import AXES
 from .pair import join_names
 from .reliability import DOUBTFUL
@@ -89,9 +89,11 @@ def _of_fit(done: Done) -> list[str]:
 def _of_control(done: Done) -> list[str]:
     if done.ground is None:
         scale = " and scale" if done.bars is None else ""
+        named = {PHOTOS: "its stations", POINTS: "its points"}
+        datum = named.get(done.datum, f"the points {done.datum.replace(',', ', ')}")
         return [
             f"Without known points the block has any position{scale}; standard "
-            "deviations refer to its stations as a whole (inner constraints)."
+            f"deviations refer to {datum} as a whole (inner constraints)."
         ]
     used = done.control.known & ~done.wrong_control
     poorly = used & (done.control_redundancy < POORLY)

@@ -120,3 +120,69 @@ def test_a_short_strip_with_wrong_ties_comes_to_rest(seed):
     assert found.adjustment.result == RESULTS.successful and oriented.wrong.settled
     assert found.adjustment.iterations < 6 and 0.8 < found.sigma0 < 1.25
     assert not np.any(find_rays(found.block, measured, bad) & found.numbered.rays)
+
+
+@pytest.mark.parametrize("names", [None, 5])
+def test_a_datum_of_points_has_the_cofactors_of_the_pseudo_inverse(names):
+    """P N⁺ Pᵀ with the weights of the datum points alone; what lies between photos and
+    points stays what it was."""
+    first, _ = adjust_freely(1, 4)
+    begin = adjust_block(first.block, first.as_start).check()
+    seen = np.flatnonzero(begin.numbered.number >= 0)
+    some = None if names is None else [begin.block.points[k] for k in seen[::names]]
+    found = block.refer_to_points(begin, some)
+    a, photos = dense_slopes(found), len(found.block.photos)
+    unit = np.full(a.shape[1], distance_of(found))
+    unit[: 6 * photos].reshape(photos, 6)[:, :3] = 1.0
+    values, vectors = np.linalg.eigh((a * unit).T @ (a * unit))
+    g, rest = vectors[:, :7], vectors[:, 7:]
+    pseudo = rest / values[7:] @ rest.T
+    weight = np.zeros((len(seen), 3))
+    weight[:: names or 1] = 1.0
+    weighted = g.T * np.concatenate([np.zeros(6 * photos), weight.ravel()])
+    p = np.eye(len(unit)) - g @ np.linalg.solve(weighted @ g, weighted)
+    q = p @ pseudo @ p.T * np.outer(unit, unit)
+    of_points = np.sqrt(np.diagonal(q)[6 * photos :].reshape(-1, 3))
+    np.testing.assert_allclose(
+        found.deviations[seen], found.sigma0 * of_points, rtol=1e-5
+    )
+    centres = np.sqrt(np.diagonal(q)[: 6 * photos].reshape(photos, 6)[:, 3:])
+    np.testing.assert_allclose(
+        found.centre_deviations, found.sigma0 * centres, rtol=1e-5
+    )
+    names = [found.block.points[k] for k in seen[[1, 9]]]
+    covariance = block.joint_covariance(found, points=names)
+    rows = 6 * photos + 3 * np.array([[1], [9]]) + np.arange(3)[None]
+    both = found.sigma0**2 * q[np.ix_(rows.ravel(), rows.ravel())]
+    np.testing.assert_allclose(covariance, both, atol=1e-5 * np.max(np.abs(both)))
+    one, two = (
+        block.relative_covariance(each, "1-1", "1-2") for each in (begin, found)
+    )
+    np.testing.assert_allclose(
+        one.covariance[:3, :3], two.covariance[:3, :3], rtol=1e-4, atol=1e-12
+    )
+    # an error of a place moves its point by Q Aᵀ, on this datum
+    moved = block.assess_block(found).rays.point
+    checked = np.all(found.redundancy > 0.1, axis=1)
+    ray = np.flatnonzero(checked)[7]
+    k = 2 * np.sum(found.numbered.rays[:ray])
+    point = found.numbered.number[found.block.point[ray]]
+    by_error = q[6 * photos + 3 * point :][:3] @ a.T[:, k : k + 2]
+    r = found.redundancy[ray]
+    delta = block.assess_block(found).delta0 * found.sigma0 / np.sqrt(r)
+    np.testing.assert_allclose(
+        np.abs(moved[ray]), np.abs(by_error.T) * delta[:, None], rtol=1e-3
+    )
+
+
+def test_a_datum_of_points_that_is_none():
+    mock = block.mock_block(1, block.Flight(models=3))
+    start = start_from(mock.block, mock.photos)
+    held = adjust_block(mock.block, start, mock.ground)
+    with pytest.raises(ValueError, match="known points hold the network"):
+        block.refer_to_points(held)
+    free = adjust_block(mock.block, start)
+    with pytest.raises(ValueError, match="'strange' is not in the adjustment"):
+        block.refer_to_points(free, ["strange"])
+    with pytest.raises(ValueError, match="on no line"):
+        block.refer_to_points(free, free.block.points[:2])

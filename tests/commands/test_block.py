@@ -146,10 +146,10 @@ def test_control_in_plan_and_in_height_alone(tables):
 
 
 def test_without_control_the_network_is_free(tables):
-    told = block((tables[0], None))
+    told = block((tables[0], None), "--datum", "points")
     assert told.exit_code == 0
     assert "free network" in told.stdout
-    assert "inner constraints" in words(told.stdout)
+    assert "refer to its points as a whole (inner constraints)" in words(told.stdout)
 
 
 def test_a_control_point_on_one_photo_counts(tables, written, tmp_path):
@@ -435,6 +435,7 @@ def divided(pairs):
         (("--control-sigma", "0.1"), "--control-sigma: found it without --control"),
         (("--level", "2"), "--level: found 2.0"),
         (("--inner", "focal,zoom"), "--inner: found 'zoom'; expected some of focal"),
+        (("--datum", "points"), "--datum: found it beside no table"),
     ],
 )
 def test_options_without_their_table(arguments, said):
@@ -448,6 +449,7 @@ def test_options_without_their_table(arguments, said):
         (("--models", "3"), "--models: found it beside a table"),
         (("--control-sigma", "0.1"), "found it beside the standard deviations"),
         (("--bars", "BARS"), "found no bar with both of its points"),
+        (("--datum", "points"), "--datum: found it beside --control"),
         (("--rays", "RAYS"), "column photo: found 'strange'; expected a photo of"),
     ],
 )

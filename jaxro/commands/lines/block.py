@@ -66,6 +66,15 @@ InnerNames = Annotated[
         show_default=False,
     ),
 ]
+Datum = Annotated[
+    str | None,
+    typer.Option(
+        help="What the deviations of a free network refer to: photos, points (all of "
+        "them), or some points by their names.  [default: photos]",
+        metavar="photos|points|NAME,...",
+        show_default=False,
+    ),
+]
 Components = Annotated[
     bool,
     typer.Option(
@@ -170,6 +179,7 @@ def block(
     y_down: given.YDown = False,
     sigma: Sigma = None,
     inner: InnerNames = None,
+    datum: Datum = None,
     components: Components = False,
     conditions: Conditions = False,
     classical: Classical = False,
@@ -216,6 +226,7 @@ def block(
         rays=rays,
         bars=bars,
         inner=inner,
+        datum=datum,
         components=components,
         conditions=conditions,
         classical=classical,
