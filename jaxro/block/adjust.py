@@ -22,7 +22,7 @@ from ..calibration.camera import Station
 from ..calibration.field import Field
 from ..xla.programs import compiled
 from .bars import Bars, no_bars
-from .displacements import FoundField, of_rays, read_fields
+from .displacements import FoundField, areas_of, of_rays, read_fields
 from .given import Given
 from .inner import Inner, InnerParameters, cameras_of, in_photo_units, own_blocks
 from .measured_block import Ground, MeasuredBlock
@@ -217,7 +217,8 @@ class BlockAdjustment:
         block, photo = self.block, self.block.photo
         points = self.frame.inside(np.nan_to_num(self.coordinates))[block.point]
         stations = jax.tree.map(lambda a: np.asarray(a)[photo], self.stations)
-        found = self._misfits_at(stations, points)
+        camera = cameras_of(block).of_photo[photo]
+        found = self._misfits_at(stations, points, camera, places_of(block))
         off = found * block.focal[photo, None]
         there = self.numbered.number[block.point] >= 0
         return np.where(there[:, None], off * np.array([-1.0, 1.0]), np.nan)
@@ -226,33 +227,44 @@ class BlockAdjustment:
     def ideal_places(self) -> Float[np.ndarray, "ray 2"]:
         """The places of all rays as a camera without any distortion would show them, in
         units of its focal length, y downwards."""
-        places = places_of(self.block)
+        camera = cameras_of(self.block).of_photo[self.block.photo]
+        return self.ideal(camera, places_of(self.block))
+
+    def ideal(
+        self, camera: Int[np.ndarray, " place"], places: Float[np.ndarray, "place 2"]
+    ) -> Float[np.ndarray, "place 2"]:
+        """The same of any places of the cameras of these numbers."""
         if self.inner is None:
             return places
-        rays = len(places)
-        turned = np.tile([1.0, 0.0, 0.0, 0.0], (rays, 1))
-        here = Station(*jax.device_put((turned, np.zeros((rays, 3)))))
-        ahead = np.concatenate([places, np.ones((rays, 1))], axis=1)
+        number = len(places)
+        turned = np.tile([1.0, 0.0, 0.0, 0.0], (number, 1))
+        here = Station(*jax.device_put((turned, np.zeros((number, 3)))))
+        ahead = np.concatenate([places, np.ones((number, 1))], axis=1)
         scale = 1.0
         if self.inner.focal:
-            camera = cameras_of(self.block).of_photo[self.block.photo]
             own = np.asarray(self.adjustment.parameters["camera"])
             scale = 1.0 + own[camera, :1]
-        return places + self._misfits_at(here, ahead) / scale
+        return places + self._misfits_at(here, ahead, camera, places) / scale
 
     def _misfits_at(
-        self, stations: Station, points: Float[np.ndarray, "ray 3"]
-    ) -> Float[np.ndarray, "ray 2"]:
-        """The misfits of all rays from these stations to these points."""
-        block, own, places = self.block, (), places_of(self.block)
-        seen = places
+        self,
+        stations: Station,
+        points: Float[np.ndarray, "place 3"],
+        camera: Int[np.ndarray, " place"],
+        places: Float[np.ndarray, "place 2"],
+    ) -> Float[np.ndarray, "place 2"]:
+        """The misfits of places from these stations to these points."""
+        own, seen, block = (), places, self.block
         if self.inner is not None:
-            camera = cameras_of(block).of_photo[block.photo]
+            of_photos = cameras_of(block)
+            areas = areas_of(
+                of_photos, of_photos.of_photo[block.photo], places_of(block)
+            )
             own = (np.asarray(self.adjustment.parameters["camera"])[camera],)
-            seen = places, of_rays(self.inner, block, places)
+            seen = places, of_rays(self.inner, areas, camera, places)
         data = with_room((stations, *own, points, seen))
         found = _misfits(*data, condition=ray_condition(self.inner))
-        return np.asarray(found)[: len(block.photo)]
+        return np.asarray(found)[: len(places)]
 
     @property
     def redundancy(self) -> Float[np.ndarray, "ray 2"]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..adjustment.sparse import with_room
 from ..calibration.brown import Brown
@@ -45,7 +45,9 @@ class MeasuredArea(NamedTuple):
 
 
 def areas_of(
-    cameras: Cameras, camera: np.ndarray, places: Float[np.ndarray, "ray 2"]
+    cameras: Cameras,
+    camera: Int[np.ndarray, " ray"],
+    places: Float[np.ndarray, "ray 2"],
 ) -> list[MeasuredArea]:
     """The measured area of each camera; `camera`: that of each of the places."""
     found = []
@@ -87,14 +89,15 @@ def _columns(
 
 
 def of_rays(
-    inner: Inner, block: MeasuredBlock, places: Float[np.ndarray, "ray 2"]
+    inner: Inner,
+    areas: list[MeasuredArea],
+    camera: Int[np.ndarray, " ray"],
+    places: Float[np.ndarray, "ray 2"],
 ) -> Float[np.ndarray, "ray 2 mode"]:
-    """The same for all rays of a block, each by the field of its camera."""
-    cameras = cameras_of(block)
-    camera = cameras.of_photo[block.photo]
+    """The same for places of several cameras, each by the field of its own."""
     found = np.zeros((len(places), 2, inner.modes))
     if inner.modes:
-        for k, area in enumerate(areas_of(cameras, camera, places)):
+        for k, area in enumerate(areas):
             found[camera == k] = at_places(inner, area, places[camera == k])
     return found
 

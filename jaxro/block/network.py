@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..adjustment import Term
 from ..calibration.camera import Camera, Measured, Station, misfit, perspective
 from ..geometry import rotations as rot
-from .displacements import of_rays, prior_variance
+from .displacements import areas_of, of_rays, prior_variance
 from .inner import Inner, OfRay, cameras_of
 from .measured_block import Ground, MeasuredBlock
 
@@ -224,8 +224,10 @@ def terms_of(
     seen = places[used]
     if inner is not None:
         cameras = cameras_of(block)
-        touches.insert(1, ("camera", cameras.of_photo[photo]))
-        seen = seen, of_rays(inner, block, places)[used]
+        camera = cameras.of_photo[block.photo]
+        touches.insert(1, ("camera", camera[used]))
+        areas = areas_of(cameras, camera, places)
+        seen = seen, of_rays(inner, areas, camera[used], seen)
         variance = variance, None
         if inner.modes:
             fields = (_of_fields(inner, block),)

@@ -17,6 +17,7 @@ from ..tables import whole
 from ..tables.fields import TableError
 from . import block_other_ways as other_ways
 from .block_request import Options, Task, inner_of, prepare, some_of
+from .cameras_out import opencv_of_block
 from .documents import settings, show_json
 from .plots import MISSING, pictures_of_block, to_files
 
@@ -38,6 +39,7 @@ def run(options: Options) -> bool:
         if out is not None:
             picture, why = _picture(done)
             files = contents(done, options.parquet) | made | picture
+            files |= opencv_of_block(done, task.cameras)
             inputs.check()
             whole.write(out, files, options.read)
             written = list(files)

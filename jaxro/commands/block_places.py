@@ -20,12 +20,13 @@ from .places import Numbered, check_one_camera, number
 @dataclass(frozen=True)
 class Places:
     """A measured block, the points in common of the pairs that join its photos, its
-    sigma in words, and whether it was given."""
+    sigma in words, and whether it was given; the `cameras` of its photos."""
 
     block: MeasuredBlock
     common: CommonPoints
     sigma: str
     sigma_known: bool
+    cameras: tuple[Camera, ...]
 
 
 def read(options: request.Options, *, are_unknown: bool) -> Places:
@@ -44,7 +45,9 @@ def read(options: request.Options, *, are_unknown: bool) -> Places:
         check_one_camera(rows)
     measured = in_photos(rows, cameras)
     numbered = number(rows, options.file)
-    block, common = _block(rows, cameras, numbered, *measured), numbered.common
+    of_photo = dict(zip(numbered.photo.tolist(), rows, strict=True))
+    own = tuple(_camera(of_photo[k], cameras) for k in range(len(numbered.photos)))
+    block, common = _block(rows, own, numbered, *measured), numbered.common
     unit, stated = deviation.parse(options.sigma), "to the given standard deviations"
     if not has_sigma and unit is None:
         with say_what("Finding the standard deviation of the photo coordinates ..."):
@@ -52,7 +55,7 @@ def read(options: request.Options, *, are_unknown: bool) -> Places:
         unit, stated = noise.sigma, deviation.sentence(noise, options.unit)
     block = block._replace(sigma=block.sigma * (1.0 if has_sigma else unit))
     known = has_sigma or options.sigma not in (None, deviation.AUTO)
-    return Places(block, common, stated, known)
+    return Places(block, common, stated, known, own)
 
 
 def in_photos(
@@ -88,7 +91,7 @@ def _camera(row: Row, cameras: Cameras) -> Camera:
 
 
 def _check_focal(
-    names: tuple[str, ...], cameras: list[Camera], of_photo: dict[int, Row]
+    names: tuple[str, ...], cameras: tuple[Camera, ...], of_photo: dict[int, Row]
 ) -> None:
     """Raises TableError where the photos of one camera are given with two."""
     first: dict[str, Camera] = {}
@@ -114,16 +117,15 @@ def _named(row: Row, cameras: Cameras) -> Camera:
 
 def _block(
     rows: list[Row],
-    cameras: Cameras,
+    own: tuple[Camera, ...],
     numbered: Numbered,
     places: Float[np.ndarray, "row 2"],
     sigma: Float[np.ndarray, " row"],
 ) -> MeasuredBlock:
-    """The block of rows with these photo coordinates; sigma is one pixel where the table
-    has none."""
+    """The block of rows with these photo coordinates, and photos with cameras of their
+    `own`; sigma is one pixel where the table has none."""
     photos, points, photo, point, _ = numbered
     of_photo = dict(zip(photo.tolist(), rows, strict=True))
-    own = [_camera(of_photo[k], cameras) for k in range(len(photos))]
     size = np.array([camera.pixel_size for camera in own])
     names = None
     if "camera" in rows[0].cells:

@@ -17,6 +17,7 @@ from ..block.measured_block import (
     from_pairs,
     ground as known_points,
 )
+from ..geometry.pairs import Camera
 from ..tables import (
     bars as bar_tables,
     ground as ground_tables,
@@ -80,7 +81,7 @@ class Task:
     """A block to be oriented, read and checked. `left`, `right`: the photos of each
     pair; `points`: the names of the rows of `pairs`; `more`: the block with further
     rays; `sigma` in words, and whether it was given (`sigma_known`); `approximate`:
-    points of the ground that are no more."""
+    points of the ground that are no more; `cameras` of the photos of `more`."""
 
     title: str
     names: list[str]
@@ -95,6 +96,7 @@ class Task:
     bars: Bars | None = None
     approximate: int = 0
     photo_unit: str = "mm"
+    cameras: tuple[Camera, ...] = ()
     warnings: tuple[str, ...] = ()
 
 
@@ -162,6 +164,7 @@ def _of_places(options: Options) -> Task:
         sigma_known=measured.sigma_known,
         ground=ground,
         more=block,
+        cameras=measured.cameras,
         bars=_bars(options),
         approximate=approximate,
         photo_unit=options.measured.unit,
@@ -314,6 +317,8 @@ def _with_rays(task: Task, options: Options, table: Table, cameras: Cameras) -> 
             found=str(error).removeprefix("from_pairs: "),
             expected="one camera for each photo",
         ) from None
+    own = map(cameras.of_photo, block.photos)
+    task = replace(task, cameras=tuple(one for one in own if one is not None))
     if options.rays is None:
         return replace(task, more=block)
     rows = images.read_places(options.rays)

@@ -11,6 +11,7 @@ from .opencv import pair_from_opencv as pair_from_opencv
 from .opencv_camera import (
     OpencvCamera as OpencvCamera,
     opencv_camera as opencv_camera,
+    opencv_cameras as opencv_cameras,
 )
 from .pixels import PhotoPoints as PhotoPoints, pair_from_pixels as pair_from_pixels
 from .pose_covariance import (

@@ -1,4 +1,5 @@
-"""A calibrated image as a camera of OpenCV: camera matrix and distortion.
+"""A calibrated image, or the cameras of a block, as cameras of OpenCV: camera matrix and
+distortion.
 
 The calibration corrects measured places, by Brown's series about the principal place,
 focal lengths by zones and a field. OpenCV distorts rays (`lens`):
@@ -19,6 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..adjustment import RESULTS
+from ..block.adjust import BlockAdjustment
+from ..block.displacements import areas_of
+from ..block.inner import cameras_of
+from ..block.network import places_of
 from ..calibration.correct import correct
 from ..calibration.result import Calibration
 from .lens import check_coefficients, distort
@@ -40,6 +46,18 @@ class OpencvCamera(NamedTuple):
     rest: float
     largest: float
 
+    def in_pixels(
+        self, pixel_size: float, origin: tuple[float, float], *, y_down: bool
+    ) -> "OpencvCamera":
+        """The camera of the image itself, whose pixels have this size and whose place
+        `origin` was that of the photo coordinates 0, 0; with y upwards (not `y_down`)
+        for the places x, -y, as OpenCV has them."""
+        x, y = origin
+        matrix = np.diag([1 / pixel_size, 1 / pixel_size, 1.0]) @ self.matrix
+        matrix[:2, 2] += x, y if y_down else -y
+        rest, largest = self.rest / pixel_size, self.largest / pixel_size
+        return OpencvCamera(matrix, self.distortion, rest, largest)
+
 
 def opencv_camera(found: Calibration) -> OpencvCamera:
     """The camera of OpenCV that is nearest to a calibration.
@@ -48,11 +66,39 @@ def opencv_camera(found: Calibration) -> OpencvCamera:
     ValueError for a calibration that is not usable, or whose rays are at more than 84°
     to the axis.
     """
-    from scipy.optimize import least_squares
-
     if not bool(found.usable):
         raise ValueError("opencv_camera: the calibration is not usable")
-    places, rays = _seen(found)
+    return _fit(*_seen(found))
+
+
+def opencv_cameras(adjusted: BlockAdjustment) -> dict[str, OpencvCamera]:
+    """The camera of OpenCV that is nearest to each camera of a block, over the area that
+    its photos have places in, by its name: in the unit of the photos, y down, the origin
+    where the principal point was given to be (`OpencvCamera.in_pixels`).
+
+    Raises ValueError for an adjustment that is not usable or has no unknown inner
+    parameters, which is the camera that was given.
+    """
+    if adjusted.result != RESULTS.successful:
+        raise ValueError("opencv_cameras: the adjustment is not usable")
+    if adjusted.inner is None:
+        raise ValueError("opencv_cameras: no inner parameters are unknown")
+    cameras, found = cameras_of(adjusted.block), {}
+    camera = cameras.of_photo[adjusted.block.photo]
+    areas = areas_of(cameras, camera, places_of(adjusted.block))
+    for k, (name, area) in enumerate(zip(cameras.names, areas, strict=True)):
+        grid = area.grid
+        rays = adjusted.ideal(np.full(len(grid), k), grid)
+        found[name] = _fit(grid * cameras.focal[k], rays)
+    return found
+
+
+def _fit(
+    places: Float[np.ndarray, "place 2"], rays: Float[np.ndarray, "place 2"]
+) -> OpencvCamera:
+    """The camera that shows rays (u, v) nearest to their places, y down."""
+    from scipy.optimize import least_squares
+
     focal = np.ptp(places, axis=0) / np.ptp(rays, axis=0)
     # all unknowns are near 1
     units = np.array([*focal, *focal, *np.ones(5)])

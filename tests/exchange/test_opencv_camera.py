@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from oracles_calibration import rotation
 
-from jaxro import calibration, exchange
+from jaxro import block, calibration, exchange
+from jaxro.block.adjust_chained import start_from
 from jaxro.calibration import Brown, Model
 from jaxro.exchange.lens import check_coefficients, distort
 
@@ -55,3 +56,37 @@ def test_what_is_not_usable_has_no_camera():
     assert not bool(found.usable)
     with pytest.raises(ValueError, match="not usable"):
         exchange.opencv_camera(found)
+
+
+def test_the_camera_of_a_block_goes_back_to_opencv():
+    """Photos in pixels by a camera of OpenCV, whose principal point and focal length are
+    given wrong: undistorted by the exported camera, places are those of the block."""
+    size, given = 0.01, (11000.0, 11200.0)
+    flight = block.Flight(strips=2, models=5, sideward=0.5, sigma=0.002)
+    mock = block.mock_block(7, flight, control_every=2)
+    true = np.array([[15300.0, 0, 11020.0], [0, 15300.0, 11230.0], [0, 0, 1]])
+    ideal = np.stack([mock.block.x, -mock.block.y], axis=1) / flight.focal
+    distortion = np.array([-0.02, 0.01, 2e-4, -1e-4, 0.0])
+    pixels = distort(ideal, check_coefficients(distortion)) @ true[:2, :2] + true[:2, 2]
+    at = (pixels - given) * size * [1, -1]
+    measured = mock.block._replace(
+        x=at[:, 0], y=at[:, 1], focal=np.full(len(mock.block.photos), 152.0)
+    )
+    inner = block.Inner(radial=2, tangential=True)
+    start = start_from(mock.block, mock.photos)
+    found = block.adjust_block(measured, start, mock.ground, inner).check()
+    (camera,) = exchange.opencv_cameras(found).values()
+    camera = camera.in_pixels(size, given, y_down=True)
+    assert camera.rest < 0.05 and camera.largest < 0.3
+    np.testing.assert_allclose(camera.matrix, true, atol=30.0)
+    np.testing.assert_allclose(camera.distortion[:2], distortion[:2], atol=2e-3)
+    rays = cv2.undistortPoints(pixels[:, None], camera.matrix, camera.distortion)[:, 0]
+    off = np.hypot(*((rays - found.ideal_places) * 15300.0).T)
+    assert np.max(off) < 1.5 * camera.largest
+
+    up = exchange.opencv_cameras(found)["1"].in_pixels(size, given, y_down=False)
+    down = camera.matrix[1, 2] - given[1]
+    assert up.matrix[1, 2] == pytest.approx(down - given[1])
+    plain = block.adjust_block(mock.block, start, mock.ground)
+    with pytest.raises(ValueError, match="no inner parameters are unknown"):
+        exchange.opencv_cameras(plain)
