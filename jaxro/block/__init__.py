@@ -1,5 +1,6 @@
 """One model, strips and blocks of oriented pairs on the ground."""
 
+from ..camera.inner import Inner as Inner
 from .absolute import orient_model as orient_model, solutions as solutions
 from .absolute_model import (
     MeasuredModel as MeasuredModel,
@@ -34,7 +35,6 @@ from .covariance import (
 )
 from .datum_of_points import refer_to_points as refer_to_points
 from .given import Given as Given, Wrong as Wrong
-from .inner import Inner as Inner
 from .measured_block import (
     Ground as Ground,
     MeasuredBlock as MeasuredBlock,

@@ -18,13 +18,14 @@ from ..adjustment.sparse import (
     read,
     with_room,
 )
-from ..calibration.camera import Station
-from ..calibration.field import Field
+from ..camera.condition import Station
+from ..camera.field import Field
+from ..camera.inner import Inner
 from ..xla.programs import compiled
 from .bars import Bars, no_bars
+from .cameras import InnerParameters, cameras_of, in_photo_units, own_blocks
 from .displacements import FoundField, areas_of, of_rays, read_fields
 from .given import Given
-from .inner import Inner, InnerParameters, cameras_of, in_photo_units, own_blocks
 from .measured_block import Ground, MeasuredBlock
 from .network import (
     Frame,

@@ -35,7 +35,7 @@ ROUNDS = 12
 class Models(NamedTuple):
     """Oriented pairs: the numbers of their photos, the rotation of right camera axes
     into the left ones, the unit base in the left ones, and how uncertain the rotation
-    is (radians). Axes as in `calibration.camera`."""
+    is (radians). Axes as in `camera.condition`."""
 
     left: Int[np.ndarray, " pair"]
     right: Int[np.ndarray, " pair"]

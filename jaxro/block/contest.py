@@ -18,15 +18,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ..adjustment import RESULTS
+from ..camera.inner import MODES, Inner, names_of
 from .adjust import BlockAdjustment
 from .adjust_chained import Outcome, adjust_chained
 from .bars import differences
+from .cameras import MOST_FIELDS, cameras_of
 from .chain import Chained
 from .columns import EQUAL_HEIGHTS, UNCERTAIN, Altered, Cause, Known, alter
 from .confusable import tell_confusable
 from .contradictions import contradictions
 from .given import Given
-from .inner import MODES, MOST_FIELDS, Inner, cameras_of, names_of
 from .measured_block import Ground
 from .place import TooLittleControl, known_in_chain, place_known, similarities
 from .wrong import CLEAR

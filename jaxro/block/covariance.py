@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..calibration.camera import Station
+from ..camera.condition import Station
 from ..geometry import rotations as rot
 from ..xla.programs import compiled
 from .adjust import BlockAdjustment

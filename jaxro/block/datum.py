@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from ..adjustment.sparse import with_room
 from ..adjustment.sparse_factor import Anchor, Datum
-from ..calibration.camera import Station
+from ..camera.condition import Station
 from ..geometry import rotations as rot
 from ..xla.programs import compiled
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..adjustment.referred import Rows, refer
-from ..calibration.camera import Station
+from ..camera.condition import Station
 from .adjust import BlockAdjustment
 
 WIDE = 1e-3

@@ -1,4 +1,4 @@
-"""The displacement field of a camera of a block (`calibration.field`): its functions at
+"""The displacement field of a camera of a block (`camera.field`): its functions at
 the places of the photos, and what was found of it.
 
 Functions and coefficients are those of a single image. The measured area is that of all
@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..adjustment.sparse import with_room
-from ..calibration.brown import Brown
-from ..calibration.field import Field, columns
-from ..calibration.zones import Area
+from ..camera.area import Area
+from ..camera.brown import Brown
+from ..camera.field import Field, columns
+from ..camera.inner import MODES, Inner
 from ..xla.programs import compiled
-from .inner import MODES, Cameras, Inner, cameras_of
+from .cameras import Cameras, cameras_of
 from .measured_block import MeasuredBlock
 
 ACROSS = 21
@@ -83,7 +84,7 @@ def _columns(
     length: float,
     brown: Brown,
 ) -> Float[Array, "place 2 mode"]:
-    """`calibration.field.columns` of places."""
+    """`camera.field.columns` of places."""
     area = Area(u, jnp.ones(len(u), bool), half_sides, principal)
     return columns(u, area, Field(length, 1.0), brown, MODES)
 

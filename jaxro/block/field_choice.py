@@ -24,11 +24,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..adjustment import RESULTS
-from ..calibration.field import Field
+from ..camera.field import Field
 from .adjust import BlockAdjustment
+from .cameras import cameras_of
 from .displacements import deviations_of
 from .given import Given, Wrong
-from .inner import cameras_of
 from .network import Start
 from .wrong import adjust_rest, adjust_without_wrong
 

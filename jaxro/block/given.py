@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from ..calibration.field import Field
+from ..camera.field import Field
+from ..camera.inner import Inner
 from .bars import Bars, no_bars
-from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, nothing_known
 
 

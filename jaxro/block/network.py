@@ -17,16 +17,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment import Term
-from ..calibration.camera import Camera, Measured, Station, misfit, perspective
+from ..camera.condition import Camera, Measured, Station, misfit, perspective
+from ..camera.inner import Inner, OfRay
 from ..geometry import rotations as rot
+from .cameras import cameras_of
 from .displacements import areas_of, of_rays, prior_variance
-from .inner import Inner, OfRay, cameras_of
 from .measured_block import Ground, MeasuredBlock
 
 
 class Start(NamedTuple):
     """Approximate values on the ground: quaternions of the rotations (w, x, y, z,
-    object to camera as in `calibration.camera`), projection centres, and points, NaN
+    object to camera as in `camera.condition`), projection centres, and points, NaN
     for those that are not known; `inner`: parameters of each camera, None for zeros."""
 
     quaternions: Float[np.ndarray, "photo 4"]

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Int
 
 from ..batches.ragged import Ragged, clean_ragged
 from ..batches.table_noise import estimate
+from ..camera.inner import Inner
 from ..geometry.pairs import Pair
 from ..orientation.axes import tell_field
 from ..rejection import Recommended, Rejection
@@ -23,7 +24,6 @@ from .contest import HARMLESS, find_cause, is_misplaced
 from .contradictions import contradictions, is_suspicious, stands_under_ground
 from .exchanged import tell_exchanged
 from .given import Given, Wrong
-from .inner import Inner
 from .measured_block import Ground, MeasuredBlock, from_pairs
 from .place import Placed, TooLittleControl
 from .wrong_photo import NEARLY_ALL, mend_photo

@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..adjustment.sparse import DatumOf, Minimum, Problem, prepare, trimmed
-from ..calibration.camera import Station
+from ..camera.condition import Station
+from ..camera.inner import Inner
 from .bars import Bars, bar_terms, no_bars
+from .cameras import cameras_of
 from .datum import free_datum
 from .given import Given
-from .inner import Inner, cameras_of
 from .measured_block import Ground, MeasuredBlock
 from .network import (
     Frame,

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..camera.area import Area
+from ..camera.condition import Camera, Rays
 from ..xla.programs import compiled, is_traced
 from ..xla.settings import MOMENT, settings_for
-from .camera import Camera, Rays
 from .images import Frame, MeasuredImage, frame
 from .known import NOTHING, Known, prior
 from .models import Model, field_weights, imitating, parameter_weights
@@ -17,7 +18,6 @@ from .problem import Observed, solve
 from .result import Calibration
 from .starts import Start, candidates
 from .verdict import verdict
-from .zones import Area
 
 FIRST_STEPS = 12
 """Steps by which the candidates of a start are told apart."""

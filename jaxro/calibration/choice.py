@@ -20,12 +20,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..adjustment import RESULTS, JointAdjustment, symmetric
+from ..camera.area import Area
+from ..camera.brown import Brown
+from ..camera.condition import Rays, perspective
+from ..camera.field import Field
+from ..camera.zones import Whole
 from ..xla.passes import count
 from ..xla.programs import compiled
-from .brown import Brown
 from .calibrate import by_size, calibrate, first_start, observe
-from .camera import Rays, perspective
-from .field import Field
 from .images import MeasuredImage, frame
 from .known import NOTHING, Known
 from .models import Model
@@ -33,7 +35,6 @@ from .padded import Common, Padded, pad
 from .problem import solve
 from .result import Calibration
 from .starts import Start
-from .zones import Area, Whole
 
 LENGTHS = (0.5, 0.8, 1.25)
 """Correlation lengths of the fields that are tried, in half sides of the area."""

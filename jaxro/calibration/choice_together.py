@@ -24,12 +24,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..adjustment import JointAdjustment, symmetric
+from ..camera.brown import Brown
+from ..camera.condition import Camera
+from ..camera.field import Field
 from ..xla.passes import count
 from ..xla.programs import compiled
-from .brown import Brown
-from .camera import Camera
 from .choice import Comparison, Figures, assess, evidence, fields_of, plain_models
-from .field import Field
 from .known import NOTHING, Known
 from .measured_images import MeasuredImages
 from .models import Model

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..adjustment import symmetric
-from .camera import Measured
+from ..camera.condition import Measured
+from ..camera.field import functions
 from .correct import ideal
-from .field import functions
 from .images import Places
 from .result import Calibration
 from .slopes import inverse_of_two, slopes

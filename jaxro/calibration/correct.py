@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..adjustment.guarded import root
+from ..camera.condition import Camera, Measured, corrected, scale
 from ..xla.programs import compiled
-from .camera import Camera, Measured, corrected, scale
 from .images import Places
 from .models import field_weights, parameter_weights
 from .result import Calibration

@@ -19,8 +19,8 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from ..adjustment import LevenbergMarquardt, symmetric
+from ..camera.condition import Rays, Station
 from .calibrate import calibrate
-from .camera import Rays, Station
 from .images import MeasuredImage, Places
 from .models import Model
 from .problem import Observed

@@ -16,10 +16,10 @@ from jaxtyping import Array, Bool, Float
 
 from ..adjustment import LevenbergMarquardt, Term, adjust
 from ..adjustment.normal_equations import solve
+from ..camera.brown import COEFFICIENTS
+from ..camera.condition import Camera, Measured, Rays, Station, corrected, misfit, scale
 from ..geometry import rotations as rot
-from .brown import COEFFICIENTS
 from .calibrate import first_fit
-from .camera import Camera, Measured, Rays, Station, corrected, misfit, scale
 from .images import Frame, MeasuredImage, Pair, Points, frame
 from .known import Known
 from .measured_images import FEWEST, TURNS, MeasuredImages

@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from ..camera.area import Pair, Places
 from ..xla.passes import count
 from ..xla.programs import compiled
 
-Places = Float[Array, "point 2"]
 Points = Float[Array, "point 3"]
-Pair = Float[Array, "2"]
 
 
 class MeasuredImage(eqx.Module):

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from ..camera.condition import Camera
 from ..xla.programs import compiled
-from .camera import Camera
 from .images import Frame
 from .models import Model
 from .problem import FIXED, Prior

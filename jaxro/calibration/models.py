@@ -6,11 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..adjustment.null_space import null_space
-from .brown import Brown
-from .camera import Rays, perspective
-from .field import Field, columns
+from ..camera.area import Area
+from ..camera.brown import Brown
+from ..camera.condition import Rays, perspective
+from ..camera.field import Field, columns
+from ..camera.zones import AbstractZones, Whole
 from .images import Places
-from .zones import AbstractZones, Area, Whole
 
 
 class Model(eqx.Module):

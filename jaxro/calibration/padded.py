@@ -11,14 +11,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .brown import COEFFICIENTS
-from .camera import Camera
-from .field import MODES
+from ..camera.area import Area
+from ..camera.brown import COEFFICIENTS
+from ..camera.condition import Camera
+from ..camera.field import MODES
 from .images import Frame, Pair, Places
 from .known import Known, prior
 from .models import Model, field_weights, imitating, parameter_weights
 from .problem import FIXED, Prior
-from .zones import Area
 
 
 class Size(NamedTuple):

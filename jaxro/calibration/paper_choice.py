@@ -28,6 +28,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..adjustment import RESULTS, JointAdjustment, critical_values
 from ..adjustment.guarded import times
+from ..camera.zones import (
+    AbstractZones,
+    Whole,
+    rectangles,
+    rings,
+    strips_along_x,
+    strips_along_y,
+)
 from ..xla.passes import count
 from ..xla.programs import compiled
 from .calibrate import by_size, first_start
@@ -37,14 +45,6 @@ from .known import NOTHING, Known
 from .models import Model
 from .padded import Padded
 from .starts import Start
-from .zones import (
-    AbstractZones,
-    Whole,
-    rectangles,
-    rings,
-    strips_along_x,
-    strips_along_y,
-)
 
 LEVEL = 0.03
 """The paper's level of stage one."""

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment import JointAdjustment, LevenbergMarquardt, Term, adjust
+from ..camera.condition import Camera, Measured, Rays, Station, misfit
 from ..xla.passes import count
-from .camera import Camera, Measured, Rays, Station, misfit
 from .images import Places, Points
 
 FIXED = 1e-6

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..adjustment import JointAdjustment, LevenbergMarquardt, Term, adjust
-from .camera import Camera, Measured, Rays, Station, misfit
+from ..camera.area import Area
+from ..camera.condition import Camera, Measured, Rays, Station, misfit
 from .first_stations import first_stations
 from .images import Frame, frame_of
 from .measured_images import MeasuredImages
 from .problem import FIXED, MAX_STEPS, Prior, prior_term
-from .zones import Area
 
 
 class Approximate(eqx.Module):

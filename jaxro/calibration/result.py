@@ -10,15 +10,15 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..adjustment import JointAdjustment, critical_values
 from ..adjustment.guarded import root, times
+from ..camera.area import Area
+from ..camera.brown import POWERS
+from ..camera.condition import Camera, Measured, Station, misfit
 from ..geometry import rotations as rot
 from ..xla.passes import count
-from .brown import POWERS
-from .camera import Camera, Measured, Station, misfit
 from .images import Frame, MeasuredImage
 from .models import Model, field_weights, parameter_weights
 from .problem import Observed
 from .results import RESULTS, is_usable
-from .zones import Area
 
 
 class Calibration(eqx.Module):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .camera import Camera, Measured, Rays, Station, misfit
+from ..camera.condition import Camera, Measured, Rays, Station, misfit
 
 
 class Slopes(NamedTuple):

@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float
 
 from ..adjustment import symmetric
 from ..adjustment.guarded import root
+from ..camera.condition import Station
 from ..geometry import rotations as rot
-from .camera import Station
 from .images import Places, Points, about_centroid
 
 Mask = Bool[Array, " point"]

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..adjustment import JointAdjustment
+from ..camera.area import Area
+from ..camera.condition import Camera, Measured, Station, misfit
 from ..xla.programs import compiled
-from .camera import Camera, Measured, Station, misfit
 from .images import Frame
 from .known import NOTHING, Known, prior
 from .measured_images import MeasuredImages
@@ -24,7 +25,6 @@ from .models import Model, field_weights, focal_weights
 from .problem_together import Approximate, approximate, solve_together
 from .results import RESULTS, is_usable
 from .verdict import verdict_of_several
-from .zones import Area
 
 
 class Together(eqx.Module):

@@ -23,10 +23,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from .. import adjustment
 from ..adjustment import critical_values, symmetric
 from ..adjustment.guarded import root
+from ..camera.condition import Camera, Measured, Rays, Station, corrected, scale
 from ..geometry import rotations as rot
 from ..xla.passes import count
 from ..xla.programs import compiled
-from .camera import Camera, Measured, Rays, Station, corrected, scale
 from .images import Frame, Points
 from .models import field_weights, parameter_weights
 from .result import Calibration

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..adjustment import critical_values
+from ..camera.zones import Whole
 from ..xla.programs import is_traced
 from .calibrate import calibrate
 from .images import MeasuredImage
 from .known import NOTHING, Known
 from .models import Model
 from .result import Calibration
-from .zones import Whole
 
 
 class ZoneTest(NamedTuple):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..batches.ragged import Ragged
 from ..block.bars import Bars
-from ..block.inner import MOST_FIELDS, Inner, cameras_of
+from ..block.cameras import MOST_FIELDS, cameras_of
 from ..block.measured_block import (
     Ground,
     MeasuredBlock,
@@ -17,6 +17,7 @@ from ..block.measured_block import (
     from_pairs,
     ground as known_points,
 )
+from ..camera.inner import Inner
 from ..geometry.pairs import Camera
 from ..tables import (
     bars as bar_tables,

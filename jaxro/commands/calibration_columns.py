@@ -8,8 +8,8 @@ import numpy as np
 
 from ..block.columns import EQUAL_HEIGHTS, LEVEL, Cause, alter, falls
 from ..calibration import Calibration, MeasuredImage, Model, calibrate
-from ..calibration.camera import Rays
 from ..calibration.known import Known
+from ..camera.condition import Rays
 
 MISFIT = 1e-3
 """Residuals over the focal length from which on a cause is looked for."""

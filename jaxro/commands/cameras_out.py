@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from ..block.inner import cameras_of
+from ..block.cameras import cameras_of
 from ..exchange.opencv_camera import OpencvCamera, opencv_camera, opencv_cameras
 from ..geometry.pairs import Camera
 from ..reports.block_model import Done as Block

@@ -22,8 +22,8 @@ from jaxtyping import Float
 
 from ..adjustment import RESULTS
 from ..block.adjust import BlockAdjustment
+from ..block.cameras import cameras_of
 from ..block.displacements import areas_of
-from ..block.inner import cameras_of
 from ..block.network import places_of
 from ..calibration.correct import correct
 from ..calibration.result import Calibration

@@ -31,7 +31,7 @@ from ..batches.joint import joint_root
 from ..batches.ragged import Ragged
 from ..block.adjust import BlockAdjustment
 from ..block.covariance import relative_covariance
-from ..calibration.camera import Station
+from ..camera.condition import Station
 from ..geometry.camera_axes import to_camera_axes
 from ..geometry.elements import AbstractElements
 from ..orientation.result import Orientation

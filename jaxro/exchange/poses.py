@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..block.adjust import BlockAdjustment
-from ..calibration.camera import Station
+from ..camera.condition import Station
 from ..geometry import rotations as rot
 from ..geometry.camera_axes import to_camera_axes
 from ..geometry.elements import AbstractElements

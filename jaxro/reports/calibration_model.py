@@ -13,12 +13,12 @@ from jaxtyping import Array, Float
 
 from ..adjustment import critical_values as critical
 from ..calibration import Calibration, Comparison, Model, Rectangles, Rings, Whole
-from ..calibration.brown import NAMES as BROWN
-from ..calibration.camera import Station
 from ..calibration.distortion import distortion_deviations
 from ..calibration.models import focal_weights
 from ..calibration.results import RESULTS
-from ..calibration.zones import AbstractZones
+from ..camera.brown import NAMES as BROWN
+from ..camera.condition import Station
+from ..camera.zones import AbstractZones
 from ..plots import CorrectionMap
 from ..tables.images import NamedImages
 from ..xla.programs import compiled

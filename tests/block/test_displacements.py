@@ -8,7 +8,7 @@ from jaxro.block import Flight, Given, Inner, adjust_block
 from jaxro.block.adjust_chained import adjust_chained, start_from
 from jaxro.block.displacements import deviations_of
 from jaxro.block.field_choice import STRENGTHS, evidence
-from jaxro.calibration.field import Field
+from jaxro.camera.field import Field
 
 FLIGHT = Flight(strips=2, models=7, sideward=0.5)
 HALF = FLIGHT.half_side

@@ -10,7 +10,7 @@ from simulated_image import AT, LENS, SIGMA, N, corrected, image
 from jaxro import calibration
 from jaxro.calibration import Field, Model
 from jaxro.calibration.difference import difference
-from jaxro.calibration.field import functions
+from jaxro.camera.field import functions
 
 FILM = Model(field=Field(0.8, 30.0))
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 from jaxro.calibration import pieces, rectangles, rings
-from jaxro.calibration.zones import Area
+from jaxro.camera.area import Area
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 
 from ..adjustment import AbstractParameters
 from ..geometry import rotations as rot
+from .area import Pair
 from .brown import corrections
-from .images import Pair
 
 Vector = Float[Array, "3"]
 

@@ -24,9 +24,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..adjustment import symmetric
+from .area import Area, Places
 from .brown import Brown, patterns
-from .images import Places
-from .zones import Area
 
 MODES = 24
 """Functions for each of dx and dy of a single image. Those beyond them have .07 of the
