@@ -5,7 +5,7 @@ import csv
 import math
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -74,15 +74,16 @@ class TableError(ValueError):
 @dataclass(frozen=True)
 class Columns:
     """The columns of a kind of table, in any order and any case; `short`: other names
-    of some; `texts`: those that hold names, where the others hold numbers; `results`:
-    columns that jaxro writes beside these, and reads again without a use for them
-    where the first one is there."""
+    of some, `foreign`: those that they have in other programs; `texts`: those that hold
+    names, where the others hold numbers; `results`: columns that jaxro writes beside
+    these, and reads again without a use for them where the first one is there."""
 
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
     short: Mapping[str, str] = field(default_factory=dict)
     texts: tuple[str, ...] = ("pair", "point")
     results: tuple[str, ...] = ()
+    foreign: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
         short = f" (or {','.join(self.short)})" if self.short else ""
@@ -95,7 +96,7 @@ class Columns:
         without_unit = name.partition("_")[0]
         if without_unit in self.results:
             return without_unit
-        return self.short.get(name, name)
+        return self.short.get(name, self.foreign.get(name, name))
 
     def places(self, header: list[str], file: str, line: int | None) -> dict[str, int]:
         """The place of every column by its full name. Raises TableError."""
@@ -208,17 +209,22 @@ def header_of(path: Path) -> list[str]:
 
 
 def lines_of(
-    text: Iterable[str], file: str, columns: Columns
+    text: Iterable[str],
+    file: str,
+    columns: Columns,
+    header: Sequence[str] | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """(line number, fields by the full names of their columns) of every line that is
-    not blank. Raises TableError.
+    not blank; `header`: that of a text without one. Raises TableError.
 
     Where semicolons or tabs separate the fields, decimals may be written with a comma,
     which becomes a point.
     """
     separator, lines = find_separator(text)
     rows = _rows(lines, file, separator)
-    line, header = next(rows, (1, None))
+    line = 1
+    if header is None:
+        line, header = next(rows, (1, None))
     if header is None:
         raise TableError(
             file,
@@ -226,7 +232,7 @@ def lines_of(
             found="no text at all",
             expected=f"a header line with {columns}",
         )
-    places = columns.places(header, file, line)
+    places = columns.places(list(header), file, line)
     for line, row in rows:
         if len(row) < len(places):
             missing = next(name for name, place in places.items() if place == len(row))

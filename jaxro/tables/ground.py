@@ -7,6 +7,9 @@ control       it takes part in an adjustment (also where the field is blank)
 check         the result is only compared with it
 approximate   it may help to begin, no more
 station       it is the projection centre of the photo of this name, of a block
+
+Columns may have the names E, N, H and the like, sXY stands for sX and sY, and lists of
+other programs are read as they are (`control_lists`).
 """
 
 import io
@@ -16,12 +19,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from . import fields
+from . import control_lists, fields
 from .fields import Columns, TableError
 from .survey_checks import Row
 
 AXES = ("x", "y", "z")
 DEVIATIONS = ("sx", "sy", "sz")
+PLAN = "sxy"
+"""The deviation of both X and Y."""
+
 ROLES = ("control", "check", "approximate")
 STATION = "station"
 SHORT = {"s_x": "sx", "s_y": "sy", "s_z": "sz"}
@@ -31,9 +37,10 @@ COORDINATES = "point,X,Y,Z, blank where a coordinate is not known; or X,Y or Z a
 
 GROUND = Columns(
     ("point",),
-    (*AXES, *DEVIATIONS, "sigma", "role"),
+    (*AXES, *DEVIATIONS, PLAN, "sigma", "role"),
     SHORT,
     texts=TEXTS,
+    foreign=control_lists.SHORT,
 )
 
 
@@ -84,9 +91,11 @@ def parse(
     rows: list[Row] = []
     first: dict[tuple[str, bool], int] = {}
     line = 1
-    given = io.StringIO(text, newline="")
-    for line, cells in fields.lines_of(given, file, GROUND):
+    table = control_lists.as_table(text, file)
+    given = io.StringIO(table.text, newline="")
+    for line, cells in fields.lines_of(given, file, GROUND, table.header):
         row = Row(file, line, dict(cells))
+        _spread_plan(row)
         if not rows:
             _check_columns(row)
         name = fields.name(cells["point"], file, line, "point")
@@ -121,6 +130,21 @@ def parse(
         roles=[_role(row, roles) for row in rows],
         lines=np.array([row.line for row in rows]),
     )
+
+
+def _spread_plan(row: Row) -> None:
+    """Makes sX and sY of sXY. Raises TableError where there are both."""
+    if PLAN not in row.cells:
+        return
+    for column in DEVIATIONS[:2]:
+        if column in row.cells:
+            raise TableError(
+                row.file,
+                column=column,
+                found=f"it beside {PLAN}",
+                expected="sXY, or sX and sY",
+            )
+        row.cells[column] = row.cells[PLAN]
 
 
 def _check_columns(row: Row) -> None:

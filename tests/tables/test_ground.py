@@ -153,3 +153,51 @@ def test_bad_tables_of_models_say_where(case):
 def test_bad_deviations_of_a_model_are_refused(columns, numbers, said):
     with pytest.raises(TableError, match=said):
         model.parse(f"point,x,y,z,{columns}\na,1,2,3,{numbers}\n", "one.csv", "one")
+
+
+LISTS = {
+    "pix4d": "a,500010.25,5200020.5,101.5,0.02,0.03\nb,500110.0,5200030.0,99.0,0.02,0.03\n",
+    "metashape": """# CoordinateSystem: LOCAL_CS["Local Coordinates (m)"]
+#Label,X/Easting,Y/Northing,Z/Altitude,Accuracy_X/Easting_(m),Accuracy_Y/Northing_(m),Accuracy_Z/Altitude_(m),Error_(m),X_error,X_est
+a,500010.25,5200020.5,101.5,0.02,0.02,0.03,0.011,0.010,500010.26
+b,500110.0,5200030.0,99.0,0.02,0.02,0.03,0.011,0.010,500110.01
+# Total Error,,,,,,,0.011,0.010,
+""",
+    "names": "name;Easting;Northing;Height;sXY;sZ\n"
+    "a;500010,25;5200020,5;101,5;0,02;0,03\nb;500110;5200030;99;0,02;0,03\n",
+    "odm": """EPSG:32632
+500010.25 5200020.5 101.5 3044 2622 IMG_0525.jpg a
+500010.25 5200020.5 101.5 1044 622 IMG_0526.jpg a
+500110.0 5200030.0 99.0 144 1622 IMG_0526.jpg b
+""",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("program", LISTS)
+def test_lists_of_control_of_other_programs_are_read_as_they_are(program):
+    read = ground.parse(LISTS[program], "list")
+    assert read.names == ["a", "b"]
+    expected = [[500010.25, 5200020.5, 101.5], [500110, 5200030, 99]]
+    np.testing.assert_array_equal(read.coordinates, expected)
+    if program == "odm":
+        assert read.deviations is None
+    else:
+        np.testing.assert_array_equal(read.deviations, [[0.02, 0.02, 0.03]] * 2)
+    lines = {"pix4d": [1, 2], "metashape": [3, 4], "names": [2, 3], "odm": [2, 4]}
+    assert read.lines.tolist() == lines[program]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("EPSG:1\n1 2 3 4 5 i.jpg\n", "line 2: found 6 entries"),
+        ("EPSG:1\n1 2 3 4 5 i.jpg a\n1 2 4 4 5 j.jpg a\n", "line 3, column point"),
+        ("a,1,2,3\nb,1,2,x\n", "line 2, column z: found 'x'"),
+        ("point,X,Y,Z,sXY,sX,sZ\na,1,2,3,1,1,1\n", "column sx: found it beside sxy"),
+        ("#Label,X/Easting,Y/Northing,Z/Altitude\na,1,2,oh\n", "line 2, column z"),
+    ],
+)
+def test_bad_lists_of_control_say_where(text, said):
+    with pytest.raises(TableError) as raised:
+        ground.parse(text, "list")
+    assert said in str(raised.value)
