@@ -46,6 +46,10 @@ lens is free of the last micrometre of distortion."""
 CLEARLY = 1.5
 """D for each coordinate at which no other cause is looked for: 1 is expected."""
 
+BADLY = 4.0
+"""D for each coordinate from which on a displacement field is tried: its programs are
+large, and lenses differ a little from any series."""
+
 TRIED = 4
 """Hypotheses about the ground that are adjusted, of those that place the block best."""
 
@@ -162,6 +166,8 @@ def _hypotheses(
     if ground_alone:
         return
     yield from _of_single_points(given, chained, level)
+    if outcome is None or _fits_badly(given, outcome):
+        yield from _of_field(given)
     yield from _of_cameras(given)
     if outcome is not None and sigma_known:
         yield from _of_sigma(given, outcome)
@@ -339,8 +345,7 @@ CAMERA = (
 
 
 def _of_cameras(given: Given) -> Iterator[Hypothesis]:
-    """Inner parameters that are not what was given, and a distortion of any form."""
-    yield from _of_field(given)
+    """Inner parameters that are not what was given."""
     if given.inner is not None:
         return
     for inner, name, said in CAMERA:
@@ -350,6 +355,11 @@ def _of_cameras(given: Given) -> Iterator[Hypothesis]:
 
         free = given._replace(inner=inner)
         yield Hypothesis(name, free, say, unknowns=len(inner.free))
+
+
+def _fits_badly(given: Given, outcome: Outcome) -> bool:
+    """Whether far more is amiss than standard deviations that are somewhat small."""
+    return _deviance(given, outcome, 0, 1.0) > BADLY * _coordinates(given)
 
 
 def _of_field(given: Given) -> Iterator[Hypothesis]:
