@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from ..block.photo_pairs import FEWEST, CommonPoints, choose_pairs, common_points
 from ..exchange import files
-from ..tables import images, whole
+from ..tables import images
 from ..tables.fields import TableError
 from ..tables.measured import COORDINATES, DEVIATIONS, Table
 from ..tables.survey_checks import Row
@@ -18,7 +18,7 @@ from ..tables.survey_checks import Row
 def are_in(file: Path | None) -> bool:
     """Whether a file of the user has a row for each place. Raises TableError where it
     cannot be read."""
-    if file is None or whole.is_parquet(file) or files.is_of_other_program(file):
+    if file is None or files.is_of_other_program(file):
         return False
     return images.are_places(file)
 

@@ -1,5 +1,5 @@
 """Tables of places measured in images, and of object points: CSV text in, `NamedImages`
-out, or one clear error.
+out, or one clear error. Places may also come in Parquet.
 
 places   point, x, y in any rectangular system of the image; optionally image (of
          several in one table), sigma (of x and y), camera (which one took the image)
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from . import fields
+from . import fields, whole
 from .fields import Columns, TableError
 from .survey_checks import Row
 
@@ -84,13 +84,21 @@ class NamedImages:
 def read_places(path: Path) -> list[Row]:
     """The places of a file; without a column `image` they are those of one image, named
     after the file. Raises TableError."""
+    if whole.is_parquet(path):
+        return _check_places(_rows_of_parquet(path, PLACES), path.stem)
     return places(fields.read_text(path), str(path), path.stem)
 
 
 def are_places(path: Path) -> bool:
-    """Whether the header of a table is that of places measured photo by photo."""
-    header = {PLACES.full(entry) for entry in fields.header_of(path)}
-    return {"image", *PLACES.required} <= header
+    """Whether the header of a table is that of places measured photo by photo. Raises
+    TableError where it cannot be read."""
+    if whole.is_parquet(path):
+        from .parquet import open_file
+
+        names = open_file(path).schema_arrow.names
+    else:
+        names = fields.header_of(path)
+    return {"image", *PLACES.required} <= {PLACES.full(entry) for entry in names}
 
 
 def read_points(path: Path) -> list[Row]:
@@ -101,12 +109,18 @@ def read_points(path: Path) -> list[Row]:
 def places(text: str, file: str, image: str) -> list[Row]:
     """The places of CSV text; `image`: the name of the image where the text has none.
     Raises TableError."""
+    return _check_places(_rows(text, file, PLACES), image)
+
+
+def _check_places(given: list[Row], image: str) -> list[Row]:
+    """Rows of places as they are written, with numbers for their numbers. Raises
+    TableError."""
     rows, seen = [], {}
-    for row in _rows(text, file, PLACES):
+    for row in given:
         of = row.cells.setdefault("image", image)
         for column in TEXTS:
             if column in row.cells:
-                fields.name(row.cells[column], file, row.line, column)
+                fields.name(row.cells[column], row.file, row.line, column)
         for axis in ("x", "y"):
             row.cells[axis] = _number(row, axis, "; delete the line to leave it out")
         if "sigma" in row.cells:
@@ -322,6 +336,30 @@ def _rows(text: str, file: str, columns: Columns) -> list[Row]:
             expected=f"{columns}, and one line for each point below them",
         )
     return found
+
+
+def _rows_of_parquet(path: Path, columns: Columns) -> list[Row]:
+    """The rows of a Parquet table as a CSV table of them would have them; their numbers
+    count from 1. Raises TableError."""
+    from .parquet import read_columns
+
+    table = read_columns(path)
+    places = columns.places(list(table), str(path), None)
+    names = list(table)
+    texts = {name: list(map(_text, table[names[k]])) for name, k in places.items()}
+    rows = zip(*texts.values(), strict=True)
+    found = [
+        Row(str(path), k, dict(zip(texts, cells, strict=True)))
+        for k, cells in enumerate(rows, 1)
+    ]
+    if not found:
+        raise TableError(path, found="no rows", expected=str(columns))
+    return found
+
+
+def _text(value: Any) -> str:
+    """An entry of a Parquet table as CSV text has it."""
+    return "" if value is None else str(value)
 
 
 def _number(row: Row, column: str, advice: str = "") -> float:

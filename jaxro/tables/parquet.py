@@ -61,6 +61,29 @@ class Scan(NamedTuple):
         return np.diff(self.begins)
 
 
+def open_file(path: Path) -> Any:
+    """A Parquet file. Raises TableError where it is none."""
+    try:
+        return pq.ParquetFile(path, pre_buffer=False)
+    except DAMAGED as error:
+        raise _damaged(path, error) from None
+
+
+def read_columns(path: Path) -> dict[str, list[Any]]:
+    """All columns of a Parquet file by their names, None where an entry is missing.
+    Raises TableError."""
+    try:
+        return open_file(path).read().to_pydict()
+    except DAMAGED as error:
+        raise _damaged(path, error) from None
+
+
+def _damaged(path: Path, error: Exception) -> TableError:
+    """What is said of a file that Arrow cannot read."""
+    found = f"no Parquet file that can be read ({str(error).splitlines()[0]})"
+    return TableError(path, found=found, expected="a Parquet table of measured points")
+
+
 class Source:
     """A Parquet table of measured points. Raises TableError where it is none.
 
@@ -72,13 +95,7 @@ class Source:
         self.path, self._own = told or path, path
         self._relative = relative
         self._has_lines = self.path != path and not relative
-        try:
-            self._file = pq.ParquetFile(path, pre_buffer=False)
-        except DAMAGED as error:
-            found = f"no Parquet file that can be read ({str(error).splitlines()[0]})"
-            raise TableError(
-                path, found=found, expected="a Parquet table of measured points"
-            ) from None
+        self._file = open_file(path)
         self.columns = _columns(path, self._file.schema_arrow)
         self._position, self._batches = -1, iter(())
         self._left: Any = None

@@ -96,3 +96,32 @@ def test_what_cannot_be_calibrated_is_named():
     with pytest.raises(TableError, match=r"line 2.*2 known points in image 'first'"):
         tables.check_known(known, "points.csv")
     tables.check_seen(known)
+
+
+def test_places_in_parquet_are_those_in_csv(tmp_path):
+    pa = pytest.importorskip("pyarrow")
+    import pyarrow.parquet as pq
+
+    text = "photo,point,x,y,sigma\n1,a,0.1,-2.5,0.01\n2,a,1e-07,3.0,0.02\n"
+    table = pa.table(
+        {
+            "photo": pa.array([1, 2]),
+            "point": pa.array(["a", "a"]).dictionary_encode(),
+            "x": pa.array([0.1, 1e-7]),
+            "y": pa.array([-2.5, 3.0]),
+            "sigma": pa.array([0.01, 0.02]),
+        }
+    )
+    path = tmp_path / "places.parquet"
+    pq.write_table(table, path)
+    assert tables.are_places(path)
+    expected = tables.places(text, "places.csv", "unused")
+    found = tables.read_places(path)
+    assert [row.cells for row in found] == [row.cells for row in expected]
+    gap = {"photo": ["1"], "point": ["a"], "x": pa.array([None], pa.float64())}
+    pq.write_table(pa.table(gap | {"y": [1.0]}), path)
+    with pytest.raises(TableError, match="line 1, column x: found an empty field"):
+        tables.read_places(path)
+    path.write_bytes(b"PAR1 and nothing else")
+    with pytest.raises(TableError, match="no Parquet file that can be read"):
+        tables.are_places(path)

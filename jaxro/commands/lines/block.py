@@ -161,7 +161,7 @@ def block(
         typer.Argument(
             help="Table of pairs as of jaxro orient, CSV or Parquet, with the columns "
             "left and right (the names of the photos) or pairs named LEFT-RIGHT; or of "
-            "places, one row for each: photo,point,x,y, optionally sigma; or "
+            "places, one row for each: photo,point,x,y, optionally sigma and camera; or "
             "Bundler's FILE.out, or the folder of a COLMAP text model. Without it a "
             "simulated block.",
             metavar="PAIRS.csv",
