@@ -258,9 +258,8 @@ class BlockAdjustment:
         own, seen, block = (), places, self.block
         if self.inner is not None:
             of_photos = cameras_of(block)
-            areas = areas_of(
-                of_photos, of_photos.of_photo[block.photo], places_of(block)
-            )
+            of_rows = of_photos.of_photo[block.photo], places_of(block)
+            areas = areas_of(of_photos, *of_rows) if self.inner.modes else []
             own = (np.asarray(self.adjustment.parameters["camera"])[camera],)
             seen = places, of_rays(self.inner, areas, camera, places)
         data = with_room((stations, *own, points, seen))

@@ -24,6 +24,11 @@ from .measured_block import MeasuredBlock
 ACROSS = 21
 """Places in a row of the grid over which a field is told."""
 
+NEARLY_ALL, FAR = 0.9, 2.0
+"""A place belongs to the area of a camera if it is no farther from the middle than so
+many times the distance to which evenly spread places would reach, as that part of them
+tells it."""
+
 
 class MeasuredArea(NamedTuple):
     """The area that photos of one camera have places in: its middle and its half sides,
@@ -51,14 +56,19 @@ def areas_of(
     places: Float[np.ndarray, "ray 2"],
 ) -> list[MeasuredArea]:
     """The measured area of each camera; `camera`: that of each of the places."""
-    found = []
-    for k in range(cameras.number):
-        own = places[camera == k]
-        least, most = np.min(own, axis=0), np.max(own, axis=0)
-        # no area is a line
-        half = np.maximum((most - least) / 2, 1e-9)
-        found.append(MeasuredArea((most + least) / 2, half))
-    return found
+    return [_area_of(places[camera == k]) for k in range(cameras.number)]
+
+
+def _area_of(places: Float[np.ndarray, "place 2"]) -> MeasuredArea:
+    """The area of places, without what is far off most of them: a digit too many."""
+    if not len(places):
+        return MeasuredArea(np.zeros(2), np.ones(2))
+    away = np.abs(places - np.median(places, axis=0))
+    usual = np.quantile(away, NEARLY_ALL, axis=0) / NEARLY_ALL
+    near = places[np.all(away <= FAR * usual, axis=1)]
+    least, most = np.min(near, axis=0), np.max(near, axis=0)
+    # no area is a line
+    return MeasuredArea((most + least) / 2, np.maximum((most - least) / 2, 1e-9))
 
 
 def at_places(
@@ -169,5 +179,5 @@ def deviations_of(block: MeasuredBlock) -> Float[np.ndarray, " camera"]:
     cameras = cameras_of(block)
     camera = cameras.of_photo[block.photo]
     spread = block.sigma / block.focal[block.photo]
-    each = [np.median(spread[camera == k]) for k in range(cameras.number)]
-    return np.array(each)
+    of = lambda own: np.median(own) if len(own) else np.median(spread)
+    return np.array([of(spread[camera == k]) for k in range(cameras.number)])

@@ -227,7 +227,7 @@ def terms_of(
         cameras = cameras_of(block)
         camera = cameras.of_photo[block.photo]
         touches.insert(1, ("camera", camera[used]))
-        areas = areas_of(cameras, camera, places)
+        areas = areas_of(cameras, camera, places) if inner.modes else []
         seen = seen, of_rays(inner, areas, camera[used], seen)
         variance = variance, None
         if inner.modes:

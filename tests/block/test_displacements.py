@@ -6,8 +6,10 @@ import pytest
 from jaxro import block
 from jaxro.block import Flight, Given, Inner, adjust_block
 from jaxro.block.adjust_chained import adjust_chained, start_from
-from jaxro.block.displacements import deviations_of
+from jaxro.block.cameras import cameras_of
+from jaxro.block.displacements import areas_of, deviations_of
 from jaxro.block.field_choice import STRENGTHS, evidence
+from jaxro.block.network import places_of
 from jaxro.camera.field import Field
 
 FLIGHT = Flight(strips=2, models=7, sideward=0.5)
@@ -76,6 +78,20 @@ def test_a_field_is_what_the_film_was_bent_by():
     np.testing.assert_allclose(
         evidence(again) - evidence(again)[k], scores - scores[k], atol=0.2
     )
+
+
+def test_a_wild_place_does_not_widen_the_area():
+    mock = block.mock_block(1, FLIGHT)
+    cameras = cameras_of(mock.block)
+    camera = cameras.of_photo[mock.block.photo]
+    places = places_of(mock.block)
+    (area,) = areas_of(cameras, camera, places)
+    np.testing.assert_allclose(area.middle + area.half_sides, np.max(places, axis=0))
+    np.testing.assert_allclose(area.middle - area.half_sides, np.min(places, axis=0))
+    wild = places.copy()
+    wild[::20] *= 30
+    (other,) = areas_of(cameras, camera, wild)
+    np.testing.assert_allclose(other.half_sides, area.half_sides, rtol=0.2)
 
 
 def test_a_strength_that_is_yet_to_be_found_is_refused():
