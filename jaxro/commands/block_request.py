@@ -144,13 +144,7 @@ def _of_places(options: Options) -> Task:
     are_unknown = options.inner is not None
     measured = block_places.read(options.measured, are_unknown=are_unknown)
     block, common = measured.block, measured.common
-    number = cameras_of(block).number
-    if number > MOST_FIELDS and "field" in (options.inner or "").split(","):
-        raise TableError(
-            "--inner",
-            found=f"field for {number} cameras",
-            expected=f"at most {MOST_FIELDS} cameras with a displacement field",
-        )
+    _check_fields(options, block)
     ground, approximate = _control(options)
     name = lambda photos: [block.photos[k] for k in photos]
     left, right = name(common.left), name(common.right)
@@ -268,6 +262,17 @@ def inner_of(given: str | None) -> Inner | None:
     )
 
 
+def _check_fields(options: Options, block: MeasuredBlock) -> None:
+    """Raises TableError where more cameras are to have a displacement field than can."""
+    inner, number = inner_of(options.inner), cameras_of(block).number
+    if inner is not None and inner.field and number > MOST_FIELDS:
+        raise TableError(
+            "--inner",
+            found=f"field for {number} cameras",
+            expected=f"at most {MOST_FIELDS} cameras with a displacement field",
+        )
+
+
 def _bars(options: Options) -> Bars | None:
     """The scale bars. Raises TableError."""
     if options.bars is None:
@@ -318,6 +323,7 @@ def _with_rays(task: Task, options: Options, table: Table, cameras: Cameras) -> 
             found=str(error).removeprefix("from_pairs: "),
             expected="one camera for each photo",
         ) from None
+    _check_fields(options, block)
     own = map(cameras.of_photo, block.photos)
     task = replace(task, cameras=tuple(one for one in own if one is not None))
     if options.rays is None:

@@ -219,6 +219,11 @@ def test_a_row_for_each_place_is_the_same_block(tables, written, tmp_path):
         (["1,a,0,0,A", "2,a,5,0,B"], (), "column camera: found 'B' beside 'A'"),
         (["1,a,0,0,A"], ("--rays", "RAYS"), "--rays: found it beside"),
         (["1,a,0,0,A"], ("--camera", "OTHER"), "column photo: found '1'; expected a"),
+        (
+            [f"{k},p{j},{j},{k},{k}" for k in range(11) for j in range(6)],
+            ("--inner", "focal, field", "--sigma", "1"),
+            "--inner: found field for 11 cameras; expected at most 10",
+        ),
     ],
 )
 def test_places_that_make_no_block(rows, more, said, tmp_path):
