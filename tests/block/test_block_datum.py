@@ -186,3 +186,27 @@ def test_a_datum_of_points_that_is_none():
         block.refer_to_points(free, ["strange"])
     with pytest.raises(ValueError, match="on no line"):
         block.refer_to_points(free, free.block.points[:2])
+
+
+@pytest.mark.slow
+def test_distances_do_not_know_the_datum():
+    """With a scale by bars and an unknown focal length: distances and their deviations,
+    and the camera, are the same on a datum of points."""
+    mock = block.mock_block(2, block.Flight(models=5))
+    often = np.flatnonzero(np.bincount(mock.block.point) >= 3)
+    one, other, third = (mock.block.points[k] for k in often[[0, -1, 9]])
+    length = np.linalg.norm(mock.points[often[0]] - mock.points[often[-1]])
+    bars = block.bars([one], [other], np.array([length]), 0.02)
+    start = start_from(mock.block, mock.photos)
+    inner = block.Inner(principal=False)
+    found = adjust_block(mock.block, start, None, inner, bars=bars).check()
+    referred = block.refer_to_points(found)
+    for a, b in ((one, other), (one, third)):
+        before, after = (block.difference(each, a, b) for each in (found, referred))
+        assert after.distance == before.distance
+        assert after.distance_deviation == pytest.approx(before.distance_deviation)
+    np.testing.assert_allclose(
+        referred.cameras.deviations, found.cameras.deviations, rtol=1e-6
+    )
+    worse = np.nanmean(found.deviations**2) / np.nanmean(referred.deviations**2)
+    assert worse > 1
