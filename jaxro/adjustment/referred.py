@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from ..xla.programs import compiled
 from .sparse import SparseAdjustment
-from .sparse_factor import CofactorMatrix
+from .sparse_factor import CofactorMatrix, change_datum
 from .sparse_normals import Data, Roles, Shifts, along_rows
 
 Rows = Mapping[str, Float[np.ndarray, "_ _ _"]]
@@ -61,10 +61,7 @@ class Referred(NamedTuple):
 
     def _more(self, g: np.ndarray, f: np.ndarray) -> np.ndarray:
         """Q' - Q between parameters with these rows of G and of F."""
-        inner = self.held @ (self.rows.T @ self.spread) @ self.held.T
-        once = g @ self.held @ np.swapaxes(f, -1, -2)
-        twice = g @ inner @ np.swapaxes(g, -1, -2)
-        return twice - once - np.swapaxes(once, -1, -2)
+        return change_datum((g, f), (g, f), self.held, self.rows.T @ self.spread)
 
 
 def refer(found: SparseAdjustment, movements: Rows, datum: Rows) -> SparseAdjustment:

@@ -235,6 +235,21 @@ class Factored:
         return parts[self.levels.place] if ordered else parts
 
 
+def change_datum(
+    one: tuple[np.ndarray, np.ndarray],
+    other: tuple[np.ndarray, np.ndarray],
+    held: Float[np.ndarray, "k k"],
+    across: Float[np.ndarray, "k k"],
+) -> np.ndarray:
+    """P Q Pᵀ - Q, P = 1 - G K R, between parameters that are given by their rows of G and
+    of F = Q Rᵀ; `held`: K = (R G)⁻¹; `across`: R F."""
+    (g, f), (g_other, f_other) = one, other
+    turned = lambda a: np.swapaxes(a, -1, -2)
+    twice = g @ (held @ across @ held.T) @ turned(g_other)
+    once = g @ held @ turned(f_other)
+    return twice - once - f @ held.T @ turned(g_other)
+
+
 @dataclass
 class Free:
     """What a free network can do without any residual changing: the `movements` G; K =
@@ -271,12 +286,8 @@ class Free:
 
     def correction(self, one, other):
         """P Q Pᵀ - Q between parameters, each given by their rows of G and of F."""
-        (g, f), (g_other, f_other) = one, other
-        turned = lambda a: np.swapaxes(a, -1, -2)
-        inner = self.held @ (self.rows @ self.spread[: self.rows.shape[1]])
-        twice = g @ (inner @ self.held.T) @ turned(g_other)
-        once = g @ self.held @ turned(f_other)
-        return twice - once - f @ self.held.T @ turned(g_other)
+        across = self.rows @ self.spread[: self.rows.shape[1]]
+        return change_datum(one, other, self.held, across)
 
 
 def factorise(

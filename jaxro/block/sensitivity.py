@@ -52,8 +52,9 @@ def differentiate(
     photos: Sequence[str] = (),
     points: Sequence[str] = (),
 ) -> Derivatives:
-    """The derivatives of all photos and points that are named by all measurements.
-    Raises ValueError for a name that is not in the adjustment."""
+    """The derivatives of all photos and points that are named by all measurements. A
+    displacement field is that of the measured place, as in the adjustment itself. Raises
+    ValueError for a name that is not in the adjustment."""
     asked = ask(adjusted, photos, points)
     block, used = adjusted.block, adjusted.numbered.rays
     unit = np.zeros((adjusted.adjustment.all_cofactors.number, len(asked.rows)))
@@ -63,7 +64,9 @@ def differentiate(
     rays = np.zeros((number, len(block.photo), 2))
     # a place is (x, -y) over the focal length
     turned = np.array([1.0, -1.0]) / block.focal[block.photo[used], None]
-    rays[:, used] = np.stack([own[0] for own in found]) * turned
+    # with unknown inner parameters what is observed of a ray is a place and its field
+    of_place = (lambda seen: seen) if adjusted.inner is None else (lambda seen: seen[0])
+    rays[:, used] = np.stack([of_place(own[0]) for own in found]) * turned
     points_known = 0 if adjusted.ground is None else len(adjusted.ground.points)
     control = np.zeros((number, points_known, 3))
     for k, part in enumerate(adjusted.known, start=1):

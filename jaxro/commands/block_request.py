@@ -17,7 +17,7 @@ from ..block.measured_block import (
     from_pairs,
     ground as known_points,
 )
-from ..camera.inner import Inner
+from ..camera.inner import Inner, names_of
 from ..geometry.pairs import Camera
 from ..tables import (
     bars as bar_tables,
@@ -35,7 +35,7 @@ from .block_places import in_photos
 from .places import are_in, pair_names
 
 RADIAL = ("k1", "k2", "k3")
-INNER = ("focal", "principal", *RADIAL, "tangential", "affinity", "field")
+INNER = names_of(Inner(True, True, len(RADIAL), True, True, True))
 """Inner parameters by the names of --inner; those of Brown stand for all below them."""
 
 EXACT = 1e-3

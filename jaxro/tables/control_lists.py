@@ -23,11 +23,11 @@ SYSTEM = re.compile(r"\s*(\+proj|epsg:|wgs ?84|utm)", re.IGNORECASE)
 """How the first line of ODM's list begins."""
 
 READ = re.compile(
-    r"#?label|[xyz]/(easting|northing|altitude)|[xyz]|"
-    r"accuracy_[xyz](/(easting|northing|altitude))?(_\(.*\))?",
+    r"#?label|[xyz]/(easting|northing|altitude)|[xyz]|accuracy.*",
     re.IGNORECASE,
 )
-"""The columns of Metashape that are read."""
+"""The columns of Metashape that are read; an accuracy of another kind than those below
+is an unknown column, and none that is lost."""
 
 SHORT = {
     "e": "x",
@@ -47,6 +47,7 @@ SHORT = {
     "accuracy_y": "sy",
     "accuracy_z": "sz",
     "accuracy_xy": "sxy",
+    "accuracy_x/y/z": "sigma",
 }
 """Columns of points on the ground by the names that they have elsewhere."""
 
@@ -106,7 +107,7 @@ def _plain(name: str) -> str:
     """A column of Metashape without marks and units: Accuracy_X/Easting_(m) is
     accuracy_x."""
     name = re.sub(r"_\(.*\)", "", name.strip().lower().lstrip("#"))
-    return name.partition("/")[0] if name.startswith("accuracy") else name
+    return re.sub(r"^(accuracy_[xyz])/(easting|northing|altitude)$", r"\1", name)
 
 
 def _of_odm(lines: list[str], file: str) -> Lines:

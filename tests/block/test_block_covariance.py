@@ -203,12 +203,18 @@ def test_derivatives_are_those_of_the_finished_adjustment(free):
     np.testing.assert_allclose(own, expected, rtol=1e-5, atol=1e-6 * np.abs(own).max())
 
 
-def test_derivatives_give_the_covariance():
+@pytest.mark.parametrize(
+    ("inner", "size"), [(None, 1.0), (block.Inner(principal=False), 0.05)]
+)
+def test_derivatives_give_the_covariance(inner, size):
     """Of measurements without large residuals: Σ (dx/dl)² σ² is the cofactor matrix, to
-    the second-order term of the residuals."""
-    mock = block.mock_block(1, block.Flight(models=3))
+    the second-order term of the residuals, which a focal length that is hardly
+    determined makes large."""
+    flight = block.Flight(models=3)
+    flight = flight._replace(sigma=size * flight.sigma)
+    mock = block.mock_block(1, flight, control_sigma=size * 0.02)
     start = start_from(mock.block, mock.photos)
-    found = adjust_block(mock.block, start, mock.ground)
+    found = adjust_block(mock.block, start, mock.ground, inner)
     names = mock.block.photos[:1]
     slopes = differentiate(found, names, POINTS)
     rays = slopes.rays * mock.block.sigma[:, None]

@@ -163,6 +163,9 @@ a,500010.25,5200020.5,101.5,0.02,0.02,0.03,0.011,0.010,500010.26
 b,500110.0,5200030.0,99.0,0.02,0.02,0.03,0.011,0.010,500110.01
 # Total Error,,,,,,,0.011,0.010,
 """,
+    "metashape_plan": "#Label,X/Easting,Y/Northing,Z/Altitude,Accuracy_XY_(m),"
+    "Accuracy_Z_(m)\na,500010.25,5200020.5,101.5,0.02,0.03\n"
+    "b,500110.0,5200030.0,99.0,0.02,0.03\n",
     "names": "name;Easting;Northing;Height;sXY;sZ\n"
     "a;500010,25;5200020,5;101,5;0,02;0,03\nb;500110;5200030;99;0,02;0,03\n",
     "odm": """EPSG:32632
@@ -183,8 +186,8 @@ def test_lists_of_control_of_other_programs_are_read_as_they_are(program):
         assert read.deviations is None
     else:
         np.testing.assert_array_equal(read.deviations, [[0.02, 0.02, 0.03]] * 2)
-    lines = {"pix4d": [1, 2], "metashape": [3, 4], "names": [2, 3], "odm": [2, 4]}
-    assert read.lines.tolist() == lines[program]
+    lines = {"pix4d": [1, 2], "metashape": [3, 4], "odm": [2, 4]}
+    assert read.lines.tolist() == lines.get(program, [2, 3])
 
 
 @pytest.mark.parametrize(
@@ -195,6 +198,7 @@ def test_lists_of_control_of_other_programs_are_read_as_they_are(program):
         ("a,1,2,3\nb,1,2,x\n", "line 2, column z: found 'x'"),
         ("point,X,Y,Z,sXY,sX,sZ\na,1,2,3,1,1,1\n", "column sx: found it beside sxy"),
         ("#Label,X/Easting,Y/Northing,Z/Altitude\na,1,2,oh\n", "line 2, column z"),
+        ("#Label,X,Y,Z,Accuracy_Q\na,1,2,3,1\n", "column accuracy_q"),
     ],
 )
 def test_bad_lists_of_control_say_where(text, said):
